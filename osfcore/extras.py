@@ -1,4 +1,4 @@
-"""Packages that only some rooms need: which extra brings them, told in one sentence where they are missing."""
+"""Packages that only some parts need: which extra brings them, and one sentence where they are missing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ PACKAGES = {
     "lerobot": ("pyarrow", "imageio_ffmpeg"),
     "ros": ("websockets",),
     "usd": ("pxr",),
+    "experiments": ("matplotlib", "jinja2"),
+    "pusht": ("gym_pusht", "pytorch_mppi", "pymunk", "pygame", "shapely"),
 }  # fmt: skip
+# gym-pusht itself comes on top: it would bring an OpenCV that overwrites the headless build.
+_SECOND_STEPS = {"pusht": "pip install --no-deps gym-pusht==0.1.8"}
 _LATEST_FOR_PYBULLET = (3, 11)
 
 
@@ -31,14 +35,17 @@ class MissingExtra(OsfError):
 
     def __init__(self, what: str, extra: str, missing: list[str]) -> None:
         which = "which is not installed; get it" if len(missing) == 1 else "which are not installed; get them"
-        told = f"{what} needs {', '.join(missing)}, {which} with: pip install 'osf-manipulation[{extra}]'"
+        sentence = f"{what} needs {', '.join(missing)}, {which} with: pip install 'osf-manipulation[{extra}]'"
+        if extra in _SECOND_STEPS:
+            sentence += f" && {_SECOND_STEPS[extra]}"
         if "pybullet" in missing and sys.version_info[:2] > _LATEST_FOR_PYBULLET:
-            told += " under Python 3.11, the last one that PyBullet has wheels for"
-        super().__init__(f"{told}.")
+            sentence += " under Python 3.11, the last one that PyBullet has wheels for"
+        super().__init__(f"{sentence}.")
+        self.extra, self.missing = extra, missing
 
 
 def need(extra: str, what: str) -> None:
-    """Make sure that the packages of an extra are there, without importing them.
+    """Check that the packages of an extra are installed, without importing them.
 
     Args:
         extra: of PACKAGES.
@@ -52,19 +59,21 @@ def need(extra: str, what: str) -> None:
 
 
 def told_of(error: ModuleNotFoundError, what: str) -> MissingExtra | None:
-    """An import that failed, as a sentence; None if no extra brings the module.
+    """Explain an import that failed; None if no extra brings the module.
 
     Args:
         error: of the import.
         what: needs the module, for the sentence.
     """
     package = (error.name or "").partition(".")[0]
-    extra = next((extra for extra, packages in PACKAGES.items() if package in packages), None)
-    return None if extra is None else MissingExtra(what, extra, missing(extra))
+    for extra, packages in PACKAGES.items():
+        if package in packages:
+            return MissingExtra(what, extra, missing(extra))
+    return None
 
 
 def missing(extra: str) -> list[str]:
-    """Import names of packages of an extra that are not installed.
+    """Return the import names of packages of an extra that are not installed.
 
     Args:
         extra: of PACKAGES.

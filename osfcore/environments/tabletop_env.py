@@ -1,12 +1,11 @@
 """Rearrangement of a simulated tabletop as a Gymnasium environment.
 
-Each episode is a random rearrangement task (`osfcore.world.tasks`): a scene at rest, and how it
-shall become.
+Each episode is a random rearrangement task (`osfcore.world.tasks`): a scene at rest, and its goal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -16,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from osfcore.errors import InvalidInput, NoRoom, OsfError, finite_vector
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
-from osfcore.geometry.states import SceneState, pose_rows
+from osfcore.geometry.states import pose_rows
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S, TABLE_SIDE_M, check_action
 from osfcore.io.image_file import to_uint8
 from osfcore.metrics.success import RearrangementScore, RearrangementTask, score_of
@@ -26,61 +25,8 @@ from osfcore.world.scenes import SceneRequest, check_request
 from osfcore.world.tabletop import Tabletop
 from osfcore.world.tasks import Family, TaskSet, check_tasks, draw_task
 
-# What an environment tells of a table: spaces and values of poses and pixels.
-
-
 Kind = Literal["poses", "pixels", "both"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-
-
-def space_of(kind: Kind, objects: int, available: int, views: int, side: int) -> gymnasium.spaces.Dict:
-    """The space of observations.
-
-    Args:
-        kind: of them.
-        objects: in the scene (N).
-        available: objects to choose from.
-        views: images of the table (V).
-        side: of each image [px].
-    """
-    box = gymnasium.spaces.Box
-    spaces: dict[str, gymnasium.Space[Any]] = {"pusher": box(-PUSHER_REACH_M, PUSHER_REACH_M, (2,), np.float64)}
-    goal: dict[str, gymnasium.Space[Any]] = {}
-    if kind != "pixels":
-        spaces["objects"] = gymnasium.spaces.MultiDiscrete([available] * objects)
-        limits = np.tile([TABLE_SIDE_M] * 3 + [1.0] * 4, (objects, 1))
-        spaces["poses"] = goal["poses"] = box(-limits, limits, dtype=np.float64)
-    if kind != "poses":
-        spaces["pixels"] = box(0, 255, (views, side, side, 3), np.uint8)
-        goal["pixels"] = box(0, 255, (side, side, 3), np.uint8)
-    return gymnasium.spaces.Dict({**spaces, "goal": gymnasium.spaces.Dict(goal)})
-
-
-def observation_of(
-    state: SceneState,
-    goal: SceneState,
-    available: tuple[str, ...],
-    pixels: Mapping[str, UInt8[np.ndarray, "..."]] | None,
-    kind: Kind,
-) -> dict[str, Any]:
-    """An observation, nothing of which belongs to another one.
-
-    Args:
-        state: of the table.
-        goal: how it shall become.
-        available: objects to choose from: what is told of an object is its number in them.
-        pixels: images of "table" and "goal", where they are told.
-        kind: of the observation.
-    """
-    assert state.pusher is not None, "a simulated table has a pusher"
-    told: dict[str, Any] = {"pusher": state.pusher[:2].clip(-PUSHER_REACH_M, PUSHER_REACH_M)}
-    aim: dict[str, Any] = {}
-    if kind != "pixels":
-        told["objects"] = np.array([available.index(name) for name in state.names])
-        told["poses"], aim["poses"] = pose_rows(state.poses), pose_rows(goal.poses)
-    if pixels is not None:
-        told["pixels"], aim["pixels"] = pixels["table"].copy(), pixels["goal"].copy()
-    return {**told, "goal": aim}
 
 
 _DRAWS = 10  # of a task, where objects do not fit
@@ -96,10 +42,10 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     The action is the pusher's velocity (vx, vy) [m/s], each within 0.3, held for 0.2 s. The observation is a dict:
 
         pusher   (2,) its place [m]
-        objects  (N,) what each object is: its number among `objects_to_choose_from`    poses, both
+        objects  (N,) the number of each object among `objects_to_choose_from`    poses, both
         poses    (N, 7) position [m] and quaternion (w, x, y, z) with w >= 0, T_world_object    poses, both
-        pixels   (V, h, w, 3) what the four cameras see, linear RGB, 8 bits    pixels, both
-        goal     how the table shall become: poses (N, 7), pixels (h, w, 3) from the goal camera without the pusher
+        pixels   (V, h, w, 3) images of the four cameras, linear RGB, 8 bits    pixels, both
+        goal     of the task: poses (N, 7), pixels (h, w, 3) from the goal camera without the pusher
 
     The reward of an action is the negative distance to the goal afterwards, as a mean over the N objects,
 
@@ -155,14 +101,14 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._goal_camera = goal_camera(image_side)
         self._symmetries = {name: self._library.info(name).symmetry for name in self._available}
         self.action_space = gymnasium.spaces.Box(-_SPEED, _SPEED, (2,), np.float32)
-        self.observation_space = space_of(obs, objects, len(self._available), len(self._cameras), image_side)
+        self.observation_space = self._space(image_side)
         self._world = Tabletop(self._library, cameras=self._cameras)
         self._task: RearrangementTask | None = None
         self._goal_image: UInt8[np.ndarray, "h w 3"] | None = None
 
     @property
     def objects_to_choose_from(self) -> tuple[str, ...]:
-        """Names of the objects by the numbers that observations tell."""
+        """Names of the objects by their numbers in observations."""
         return self._available
 
     def reset(
@@ -172,8 +118,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
 
         Args:
             seed: of this task and all that follow; None to go on.
-            options: {"task_seed": s, "task_number": n} for the task n of a set that evaluations are given with seed s
-                among the same objects; else a random one.
+            options: {"task_seed": s, "task_number": n} for task n of the set that evaluations use with seed s and the
+                same objects; None for a random task.
 
         Raises:
             NoRoom: if objects do not fit, also after some draws.
@@ -200,7 +146,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return self._observation(), -score.pose6d_symmetric, score.is_tight(), False, self._info(score)
 
     def render(self) -> UInt8[np.ndarray, "h w 3"] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The table now, from the goal camera, in linear RGB of 8 bits."""
+        """Draw the table from the goal camera, in linear RGB of 8 bits."""
         if self.render_mode is None:
             return None
         self._begun()
@@ -210,28 +156,25 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """Free the simulation."""
         self._world.close()
 
-    # Tasks
-
     def _tasks(self, seed: int) -> TaskSet:
         return TaskSet(self._available, self._family, self._count, seed)
 
     def _drawn(self) -> RearrangementTask:
-        for draw in range(_DRAWS):
-            seed, number = int(self.np_random.integers(_SEEDS)), int(self.np_random.integers(_TURNS))
-            try:
-                return draw_task(self._library, self._tasks(seed), number).task
-            except NoRoom:
-                if draw == _DRAWS - 1:
-                    raise
-        raise AssertionError("the last draw returns or raises")
+        """Draw a random task."""
+        for _ in range(_DRAWS - 1):
+            with contextlib.suppress(NoRoom):
+                return self._numbered(int(self.np_random.integers(_SEEDS)), int(self.np_random.integers(_TURNS)))
+        return self._numbered(int(self.np_random.integers(_SEEDS)), int(self.np_random.integers(_TURNS)))
+
+    def _numbered(self, seed: int, number: int) -> RearrangementTask:
+        return draw_task(self._library, self._tasks(seed), number).task
 
     def _asked(self, options: dict[str, Any]) -> RearrangementTask:
+        """Draw the task that options name."""
         numbers = [options.get(key) for key in ("task_seed", "task_number")]
         if len(options) != len(numbers) or not all(isinstance(n, int) and 0 <= n < _SEEDS for n in numbers):
             raise InvalidInput("options", options, "{'task_seed': s, 'task_number': n}, whole numbers from 0 on")
-        return draw_task(self._library, self._tasks(options["task_seed"]), options["task_number"]).task
-
-    # Telling
+        return self._numbered(options["task_seed"], options["task_number"])
 
     def _begun(self) -> RearrangementTask:
         if self._task is None:
@@ -245,11 +188,31 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return to_uint8(self._world.render(cameras, with_pusher=with_pusher).images)
 
     def _observation(self) -> dict[str, Any]:
-        state: SceneState = self._world.truth()
-        pixels = None
+        """Observe table and goal; no two observations share memory."""
+        state, goal = self._world.truth(), self._begun().goal
+        assert state.pusher is not None  # for the type checker: a simulated table has a pusher
+        seen: dict[str, Any] = {"pusher": state.pusher[:2].clip(-PUSHER_REACH_M, PUSHER_REACH_M)}
+        aim: dict[str, Any] = {}
+        if self._kind != "pixels":
+            seen["objects"] = np.array([self._available.index(name) for name in state.names])
+            seen["poses"], aim["poses"] = pose_rows(state.poses), pose_rows(goal.poses)
         if self._goal_image is not None:
-            pixels = {"table": self._seen(self._cameras), "goal": self._goal_image}
-        return observation_of(state, self._begun().goal, self._available, pixels, self._kind)
+            seen["pixels"], aim["pixels"] = self._seen(self._cameras), self._goal_image.copy()
+        return {**seen, "goal": aim}
+
+    def _space(self, side: int) -> gymnasium.spaces.Dict:
+        """Build the space of observations with images of a side [px]."""
+        box = gymnasium.spaces.Box
+        spaces: dict[str, gymnasium.Space[Any]] = {"pusher": box(-PUSHER_REACH_M, PUSHER_REACH_M, (2,), np.float64)}
+        goal: dict[str, gymnasium.Space[Any]] = {}
+        if self._kind != "pixels":
+            spaces["objects"] = gymnasium.spaces.MultiDiscrete([len(self._available)] * self._count)
+            limits = np.tile([TABLE_SIDE_M] * 3 + [1.0] * 4, (self._count, 1))
+            spaces["poses"] = goal["poses"] = box(-limits, limits, dtype=np.float64)
+        if self._kind != "poses":
+            spaces["pixels"] = box(0, 255, (len(self._cameras), side, side, 3), np.uint8)
+            goal["pixels"] = box(0, 255, (side, side, 3), np.uint8)
+        return gymnasium.spaces.Dict({**spaces, "goal": gymnasium.spaces.Dict(goal)})
 
     def _info(self, score: RearrangementScore) -> dict[str, Any]:
         figures = {"moved_mm": score.moved_mm, "moved_deg": score.moved_deg, "others_mm": score.others_mm}

@@ -1,1 +1,1 @@
-"""Scenes and fields as files that other programs open: binary glTF, USD and Gaussian splats."""
+"""Scenes, fields and episodes as files for other programs: binary glTF, USD, Gaussian splats, LeRobot."""

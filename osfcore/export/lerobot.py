@@ -13,67 +13,78 @@ import imageio_ffmpeg
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from osfcore.errors import CannotWrite, InvalidInput
 from osfcore.extras import need
 from osfcore.geometry.workspace import STEP_S
 from osfcore.io.files import folder_at_once, write_atomically, write_json
 
-# What programs of LeRobot are told of a table, and under which keys.
+# Keys and meanings of the features of a table.
 #
 #     action                           (2,) the pusher's velocity (vx, vy) [m/s], each within 0.3, held for 0.2 s
 #     observation.state                (2,) the pusher's place [m]
 #     observation.environment_state    (14 N,) poses of the N objects, then those of their goals; each is position [m]
 #                                      and quaternion (w, x, y, z) with w >= 0, T_world_object
-#     observation.images.camera_0 .. 3 what the cameras see, linear RGB of 8 bits; of the goal: observation.images.goal
-#     task                             what shall be done, in words
+#     observation.images.camera_0 .. 3 images of the cameras, linear RGB of 8 bits; of the goal: observation.images.goal
+#     task                             the task in words
 #
 # LeRobot's policies take `environment_state` for the truth that only a simulator knows: a data set for policies
 # that look leaves it out.
+#
+# Layout of a data set: the format lets episodes share files; with a file for each they are written as they come, and
+# can be taken out by hand.
+#
+#     meta/info.json, stats.json, tasks.parquet    contents; statistics of all episodes; tasks in words
+#     meta/episodes/chunk-000/file-000.parquet     a row for each episode: its place, statistics
+#     data/chunk-CCC/file-FFF.parquet              a row for each action
+#     videos/KEY/chunk-CCC/file-FFF.mp4            images of a camera before each action
 
-
-ACTION, STATE, ENVIRONMENT, IMAGES = (
-    "action",
-    "observation.state",
-    "observation.environment_state",
-    "observation.images",
-)
-STATE_NAMES, ACTION_NAMES = ("pusher_x", "pusher_y"), ("vx", "vy")
+ACTION, STATE = "action", "observation.state"
+ENVIRONMENT, IMAGES = "observation.environment_state", "observation.images"
 GOAL_IMAGE = "goal"
+FPS = round(1 / STEP_S)
+_CODEC, _PIXELS = "h264", "yuv420p"
+_EVERY = "2"  # every other frame stands for itself: programs that learn read frames in any order, LeRobot's choice too
+_VERSION, _ROBOT = "v3.0", "osf_tabletop"
+_FILES_A_CHUNK = 1000
+_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+_DATA, _VIDEOS = f"data/{_FILE}.parquet", f"videos/{{video_key}}/{_FILE}.mp4"
+_EPISODES = f"meta/episodes/{_FILE}.parquet".format(chunk_index=0, file_index=0)
+_NUMBERS = ("frame_index", "episode_index", "index", "task_index")
 _POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def environment_state(poses: Float[np.ndarray, "N 7"], goal: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "D"]:
-    """Rows of poses (`pose_rows`) of N objects and of their goals as one of D = 14 N numbers."""
+    """Join rows of poses (`pose_rows`) of N objects and of their goals to D = 14 N numbers."""
     return np.concatenate([poses, goal]).reshape(-1)
 
 
 def environment_names(objects: int) -> tuple[str, ...]:
-    """What each number of an environment state is."""
+    """Name each number of an environment state."""
     whose = [f"{what}_{number}" for what in ("object", "goal") for number in range(objects)]
     return tuple(f"{one}_{name}" for one in whose for name in _POSE_NAMES)
 
 
 def image_name(camera: str) -> str:
-    """What images of a camera "0" to "3" are called."""
+    """Name the images of a camera "0" to "3"."""
     return f"camera_{camera}"
 
 
 def instruction(names: Sequence[str], moved: Sequence[str]) -> str:
-    """A task in words, such as "Push the gelatin box to its goal and leave the mug where it is.".
+    """Say a task in words, such as "Push the gelatin box to its goal and leave the mug where it is.".
 
     Args:
         names: of the objects, such as "009_gelatin_box".
-        moved: those that shall lie elsewhere; none if nobody knows.
+        moved: those that shall move; none if this is unknown.
     """
     if not moved:
         return f"Push {_listed(names)} to where the goal shows {'it' if len(names) == 1 else 'them'}."
     still = [name for name in names if name not in moved]
-    told = f"Push {_listed(moved)} to {'its goal' if len(moved) == 1 else 'their goals'}"
+    words = f"Push {_listed(moved)} to {'its goal' if len(moved) == 1 else 'their goals'}"
     if still:
-        told += f" and leave {_listed(still)} where {'it is' if len(still) == 1 else 'they are'}"
-    return f"{told}."
+        words += f" and leave {_listed(still)} where {'it is' if len(still) == 1 else 'they are'}"
+    return f"{words}."
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -90,7 +101,7 @@ Statistics = dict[str, np.ndarray]
 
 
 def statistics_of(values: Float[np.ndarray, "T D"]) -> Statistics:
-    """Of each of D numbers over T rows."""
+    """Compute the statistics of each of D numbers over T rows."""
     quantiles = dict(zip(_QUANTILES, np.quantile(values, list(_QUANTILES.values()), axis=0), strict=True))
     return {
         "min": values.min(axis=0),
@@ -103,14 +114,14 @@ def statistics_of(values: Float[np.ndarray, "T D"]) -> Statistics:
 
 
 def image_statistics(images: UInt8[np.ndarray, "T h w 3"]) -> Statistics:
-    """Of each colour of T images over their pixels, as values in [0, 1] of shape (3, 1, 1)."""
+    """Compute the statistics of each colour over the pixels of T images, in [0, 1], of shape (3, 1, 1)."""
     pixels = images[:, ::_THINNED, ::_THINNED].reshape(-1, 3) / 255
     found = {key: value.reshape(3, 1, 1) for key, value in statistics_of(pixels).items() if key != "count"}
     return {**found, "count": np.array([len(images)])}
 
 
 def pooled(parts: Sequence[Statistics]) -> Statistics:
-    """Of several data sets together; quantiles are means, weighted by count, as LeRobot's own are."""
+    """Pool statistics of several data sets; quantiles are means, weighted by count, as LeRobot's own are."""
     counts = np.array([part["count"][0] for part in parts])
     shares = counts / counts.sum()
 
@@ -129,72 +140,35 @@ def pooled(parts: Sequence[Statistics]) -> Statistics:
     }
 
 
-# The Parquet tables of a data set.
+# The files of a data set.
 
 
-def parquet(table: pa.Table) -> bytes:
-    """A table as a file."""
+def _write_table(path: Path, table: pa.Table) -> None:
     data = io.BytesIO()
     pq.write_table(table, data, compression="snappy")
-    return data.getvalue()
+    write_atomically(path, data.getvalue())
 
 
-def frames_table(
-    vectors: Mapping[str, Float[np.ndarray, "T _"]],
-    numbers: Mapping[str, Int[np.ndarray, "T"]],
-    times_s: Float[np.ndarray, "T"],
-) -> pa.Table:
-    """A row for each action.
+def _tasks_table(tasks: Sequence[str]) -> pa.Table:
+    """Number the tasks.
 
-    Args:
-        vectors: by key, D of each.
-        numbers: by key.
-        times_s: since the beginning of the episode [s].
-    """
-    columns: dict[str, Any] = {
-        key: pa.FixedSizeListArray.from_arrays(pa.array(rows.reshape(-1), pa.float32()), rows.shape[1])
-        for key, rows in vectors.items()
-    }
-    columns["timestamp"] = pa.array(times_s, pa.float32())
-    return pa.table({**columns, **{key: pa.array(values, pa.int64()) for key, values in numbers.items()}})
-
-
-def tasks_table(tasks: Sequence[str]) -> pa.Table:
-    """Each task's number, by its words.
-
-    LeRobot reads it with pandas and takes the words from the index, of which pandas is told in the table's metadata.
+    LeRobot reads the table with pandas and takes the words from the index, which the table's metadata name.
     """
     index = "__index_level_0__"
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), index: pa.array(tasks, pa.string())})
-    told = {
+    number = {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"}
+    words = {"name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object"}
+    pandas = {
         "index_columns": [index],
         "column_indexes": [],
-        "columns": [_column("task_index", "task_index", "int64"), _column(None, index, "unicode")],
+        "columns": [{**column, "metadata": None} for column in (number, words)],
         "pandas_version": "2.2.0",
     }
-    return table.replace_schema_metadata({"pandas": json.dumps(told)})
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def _column(name: str | None, field: str, kind: str) -> dict[str, Any]:
-    numpy_type = "object" if kind == "unicode" else kind
-    return {"name": name, "field_name": field, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
-
-
-def episodes_table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
-    """A row for each episode; all rows have the same keys."""
-    return pa.table({key: [row[key] for row in rows] for key in rows[0]})
-
-
-# Images of one camera as a video that can be read from any frame on.
-
-
-FPS = round(1 / STEP_S)
-CODEC, PIXELS = "h264", "yuv420p"
-_EVERY = "2"  # every other frame stands for itself: programs that learn read frames in any order, LeRobot's choice too
-
-
-def write_video(path: Path, images: UInt8[np.ndarray, "T h w 3"]) -> None:
-    """An MP4 of one image for each action.
+def _write_video(path: Path, images: UInt8[np.ndarray, "T h w 3"]) -> None:
+    """Write an MP4 that can be read from any frame on, with one image for each action.
 
     Raises:
         CannotWrite: if it cannot be encoded or written.
@@ -202,12 +176,12 @@ def write_video(path: Path, images: UInt8[np.ndarray, "T h w 3"]) -> None:
     height, width = images.shape[1:3]
     options = ["-crf", "12", "-g", _EVERY, "-bf", "0"]
     encoder = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=FPS, codec="libx264", pix_fmt_out=PIXELS, macro_block_size=2,
+        str(path), (width, height), fps=FPS, codec="libx264", pix_fmt_out=_PIXELS, macro_block_size=2,
         ffmpeg_log_level="error", output_params=options,
     )  # fmt: skip
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()  # tells what is wrong with the place, better than ffmpeg does
+        path.touch()  # its error says more about the place than that of ffmpeg
         encoder.send(None)
         for image in images:
             encoder.send(np.ascontiguousarray(image))
@@ -217,29 +191,12 @@ def write_video(path: Path, images: UInt8[np.ndarray, "T h w 3"]) -> None:
         encoder.close()
 
 
-def video_info(height: int, width: int) -> dict[str, object]:
-    """What a data set tells of its videos."""
-    return {
-        "video.height": height,
-        "video.width": width,
-        "video.codec": CODEC,
-        "video.pix_fmt": PIXELS,
-        "video.is_depth_map": False,
-        "video.fps": FPS,
-        "video.channels": 3,
-        "has_audio": False,
-    }
-
-
-# What a data set is made of, and what it came to.
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class LeRobotEpisode:
-    """An episode of T actions, each with what was known before it.
+    """An episode of T actions, each with the observation before it.
 
     Attributes:
-        task: what should be done, in words.
+        task: in words.
         actions: velocities (vx, vy) [m/s].
         pusher: its places [m].
         environment: environment states; None to leave them out.
@@ -255,8 +212,8 @@ class LeRobotEpisode:
     @property
     def vectors(self) -> dict[str, np.ndarray]:
         """All but images, by key."""
-        told = {ACTION: self.actions, STATE: self.pusher, ENVIRONMENT: self.environment}
-        return {key: rows.astype(np.float32) for key, rows in told.items() if rows is not None}
+        every = {ACTION: self.actions, STATE: self.pusher, ENVIRONMENT: self.environment}
+        return {key: rows.astype(np.float32) for key, rows in every.items() if rows is not None}
 
     @property
     def videos(self) -> dict[str, np.ndarray]:
@@ -266,31 +223,15 @@ class LeRobotEpisode:
 
 @dataclass(frozen=True, slots=True)
 class DatasetSize:
-    """What a data set holds: episodes, frames (one for each action) and different tasks."""
+    """Numbers of episodes, frames (one for each action) and different tasks of a data set."""
 
     episodes: int
     frames: int
     tasks: int
 
 
-# The files of a data set, written as its episodes come.
-
-
-_VERSION, _ROBOT = "v3.0", "osf_tabletop"
-_FILES_A_CHUNK = 1000
-_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-_DATA, _VIDEOS = f"data/{_FILE}.parquet", f"videos/{{video_key}}/{_FILE}.mp4"
-_EPISODES = f"meta/episodes/{_FILE}.parquet".format(chunk_index=0, file_index=0)
-_NUMBERS: tuple[str, ...] = ("frame_index", "episode_index", "index", "task_index")
-_PER_OBJECT = 14  # numbers of an environment state
-
-
-class Writer:
-    """A data set being written.
-
-    Args:
-        folder: for it.
-    """
+class _Writer:
+    """A data set being written to a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -301,7 +242,7 @@ class Writer:
         self._frames = 0
 
     def add(self, episode: LeRobotEpisode) -> None:
-        """Write data and videos of an episode, and keep what the tables tell of it."""
+        """Write data and videos of an episode, and keep its row and statistics."""
         self._check(episode)
         count, number = len(episode.actions), len(self._rows)
         chunk, file = divmod(number, _FILES_A_CHUNK)
@@ -310,10 +251,15 @@ class Writer:
         task = self._tasks.setdefault(episode.task, len(self._tasks))
         numbers = dict(zip(_NUMBERS, np.broadcast_arrays(steps, number, self._frames + steps, task), strict=True))
         times_s = STEP_S * steps
-        data = parquet(frames_table(episode.vectors, numbers, times_s))
-        write_atomically(self._folder / _DATA.format(**place), data)
+        columns: dict[str, Any] = {
+            key: pa.FixedSizeListArray.from_arrays(pa.array(rows.reshape(-1), pa.float32()), rows.shape[1])
+            for key, rows in episode.vectors.items()
+        }
+        columns["timestamp"] = pa.array(times_s, pa.float32())
+        columns |= {key: pa.array(values, pa.int64()) for key, values in numbers.items()}
+        _write_table(self._folder / _DATA.format(**place), pa.table(columns))
         for key, images in episode.videos.items():
-            write_video(self._folder / _VIDEOS.format(video_key=key, **place), images)
+            _write_video(self._folder / _VIDEOS.format(video_key=key, **place), images)
         plain = {**episode.vectors, **{key: one[:, None] for key, one in {"timestamp": times_s, **numbers}.items()}}
         found = {key: statistics_of(rows.astype(float)) for key, rows in plain.items()}
         found |= {key: image_statistics(images) for key, images in episode.videos.items()}
@@ -322,31 +268,31 @@ class Writer:
         self._frames += count
 
     def close(self) -> DatasetSize:
-        """Write what is told of all."""
+        """Write the tables, statistics and description of all episodes."""
         if not self._rows:
             raise InvalidInput("number of episodes", 0, "at least 1")
         size = DatasetSize(len(self._rows), self._frames, len(self._tasks))
-        write_atomically(self._folder / "meta/tasks.parquet", parquet(tasks_table(list(self._tasks))))
-        write_atomically(self._folder / _EPISODES, parquet(episodes_table(self._rows)))
+        _write_table(self._folder / "meta/tasks.parquet", _tasks_table(list(self._tasks)))
+        rows = pa.table({key: [row[key] for row in self._rows] for key in self._rows[0]})
+        _write_table(self._folder / _EPISODES, rows)
         together = {key: pooled([one[key] for one in self._statistics]) for key in self._statistics[0]}
         write_json(self._folder / "meta/stats.json", {key: _plain(found) for key, found in together.items()})
         write_json(self._folder / "meta/info.json", _info(self._shapes, size))
         return size
 
     def _check(self, episode: LeRobotEpisode) -> None:
+        """Refuse an episode without actions, or of another kind than the first."""
         count = len(episode.actions)
         if count == 0:
             raise InvalidInput("number of actions in an episode", 0, "at least 1")
         arrays = {**episode.vectors, **episode.videos}
-        uneven = [key for key, rows in arrays.items() if len(rows) != count]
-        if uneven:
-            raise InvalidInput(
-                f"number of rows of {uneven[0]}", len(arrays[uneven[0]]), f"{count}, one for each action"
-            )
+        for key, rows in arrays.items():
+            if len(rows) != count:
+                raise InvalidInput(f"number of rows of {key}", len(rows), f"{count}, one for each action")
+        for images in episode.videos.values():
+            if images.shape[1] % 2 or images.shape[2] % 2:
+                raise InvalidInput("size of images [px]", images.shape[1:3], "even, as videos need it")
         shapes = {key: rows.shape[1:] for key, rows in arrays.items()}
-        odd = [shape for shape in shapes.values() if len(shape) == len("hwc") and (shape[0] % 2 or shape[1] % 2)]
-        if odd:
-            raise InvalidInput("size of images [px]", odd[0][:2], "even, as videos need it")
         if self._shapes and shapes != self._shapes:
             raise InvalidInput(f"what episode {len(self._rows)} tells", shapes, f"as in the first one, {self._shapes}")
         self._shapes = shapes
@@ -355,7 +301,7 @@ class Writer:
 def _row(
     episode: LeRobotEpisode, number: int, first: int, place: Mapping[str, int], found: Mapping[str, Statistics]
 ) -> dict[str, Any]:
-    """What the table of episodes tells of one."""
+    """Return an episode's row of the table of episodes."""
     count = len(episode.actions)
     row = {
         "episode_index": number,
@@ -378,7 +324,7 @@ def _plain(found: Statistics) -> dict[str, Any]:
 
 
 def _info(shapes: Mapping[str, tuple[int, ...]], size: DatasetSize) -> dict[str, Any]:
-    """What a data set tells of itself."""
+    """Describe a data set."""
     features = {key: _feature(key, shape) for key, shape in shapes.items()}
     features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     features |= {key: {"dtype": "int64", "shape": [1], "names": None} for key in _NUMBERS}
@@ -400,22 +346,15 @@ def _info(shapes: Mapping[str, tuple[int, ...]], size: DatasetSize) -> dict[str,
 
 
 def _feature(key: str, shape: tuple[int, ...]) -> dict[str, Any]:
+    """Describe a feature of a data set."""
     if key.startswith(IMAGES):
-        names, info = ["height", "width", "channels"], video_info(*shape[:2])
-        return {"dtype": "video", "shape": list(shape), "names": names, "info": info}
-    names = {ACTION: ACTION_NAMES, STATE: STATE_NAMES}.get(key) or environment_names(shape[0] // _PER_OBJECT)
+        video = {"height": shape[0], "width": shape[1], "codec": _CODEC, "pix_fmt": _PIXELS, "is_depth_map": False}
+        video |= {"fps": FPS, "channels": 3}
+        info = {**{f"video.{name}": value for name, value in video.items()}, "has_audio": False}
+        return {"dtype": "video", "shape": list(shape), "names": ["height", "width", "channels"], "info": info}
+    names = {ACTION: ("vx", "vy"), STATE: ("pusher_x", "pusher_y")}.get(key)
+    names = names or environment_names(shape[0] // (2 * len(_POSE_NAMES)))
     return {"dtype": "float32", "shape": list(shape), "names": list(names)}
-
-
-# Writes episodes as a data set of LeRobot, format v3.0 (as of lerobot 0.4.4), without LeRobot.
-#
-#     meta/info.json, stats.json, tasks.parquet    what there is; statistics of all; tasks in words
-#     meta/episodes/chunk-000/file-000.parquet     a row for each episode: where it is, statistics
-#     data/chunk-CCC/file-FFF.parquet              a row for each action, a file for each episode
-#     videos/KEY/chunk-CCC/file-FFF.mp4            what a camera saw before each action, a file for each episode
-#
-# The format lets episodes share files; with one for each they are written as they come, and can be taken out by
-# hand.
 
 
 def write_dataset(folder: Path, episodes: Iterable[LeRobotEpisode]) -> DatasetSize:
@@ -432,7 +371,7 @@ def write_dataset(folder: Path, episodes: Iterable[LeRobotEpisode]) -> DatasetSi
     """
     need("lerobot", "A LeRobot data set")
     with folder_at_once(folder) as partial:
-        writer = Writer(partial)
+        writer = _Writer(partial)
         for episode in episodes:
             writer.add(episode)
         return writer.close()

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from jaxtyping import Float, Float32
+from trimesh.exchange.gltf import export_glb
+from trimesh.visual import ColorVisuals
 
 from osfcore.dynamics.shapes import field_mesh
 from osfcore.estimation.camera_response import linear_of_srgb
 from osfcore.fields.kiloosf import STEP_VOXELS, KiloOSF
 from osfcore.fields.kiloosf_query import KiloQuery
 from osfcore.fields.table import TableField
+from osfcore.fields.volume_rendering import render_weights
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
 from osfcore.geometry.poses import Pose, orthogonal_basis
@@ -23,11 +26,6 @@ from osfcore.io.image_file import to_uint8
 from osfcore.io.scene_file import Scene
 from osfcore.objects.asset import TexturedMesh, light_mesh
 from osfcore.objects.mesh import MAX_TEXTURE_SIDE
-from osfcore.render.reference import render_weights
-
-if TYPE_CHECKING:
-    import trimesh
-
 
 # Binary glTF from scenes with z up, with what trimesh's exporter leaves out: several cameras, a light, materials.
 #
@@ -37,12 +35,11 @@ if TYPE_CHECKING:
 # Colours: a texel of 200 here is shown as 200 by a screen, and stays so. glTF takes textures for sRGB and vertex
 # colours for linear: textures are kept as they are, vertex colours are decoded from sRGB.
 
-
-TABLE_FRAME = "z_up"  # the node under which everything hangs
+TABLE_FRAME = "z_up"  # the node above all others
 LIGHT_NODE = "light"
 LIGHTS_EXTENSION, UNLIT_EXTENSION = "KHR_lights_punctual", "KHR_materials_unlit"
 _Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-_OPENCV_TO_GLTF = np.diag([1.0, -1, -1, 1])  # glTF's cameras look along -z with y up
+OPENCV_TO_GLTF = np.diag([1.0, -1, -1, 1])  # cameras of glTF and USD look along -z with y up
 _NEAR_M = 0.01
 _MATTE = {"metallicFactor": 0.0, "roughnessFactor": 1.0}  # glTF's default is polished metal
 
@@ -50,28 +47,26 @@ _MATTE = {"metallicFactor": 0.0, "roughnessFactor": 1.0}  # glTF's default is po
 def glb(
     scene: trimesh.Scene, *, cameras: tuple[Camera, ...] = (), light: Light | None = None, is_unlit: bool = False
 ) -> bytes:
-    """A scene with z up as binary glTF with y up.
+    """Encode a scene with z up as binary glTF with y up.
 
-    The light is a directional one of KHR_lights_punctual, white, of intensity 0.75 pi: a white matte surface that
-    faces it then sends out 0.75, our diffuse share, in viewers that divide by pi as the extension says. glTF has no
-    ambient light; our share of 0.25 stands in the extras of the light's node.
+    The light is a directional one of KHR_lights_punctual, white, of intensity 0.75 pi. In viewers that divide by pi, as
+    the extension says, a white matte surface that faces it sends out 0.75, our diffuse share. glTF has no ambient
+    light; our share of 0.25 stands in the extras of the light's node.
 
     Args:
         scene: nodes are in metres, z up; it is changed.
-        cameras: with square pixels and the principal point in the middle as far as glTF can tell; the exact K, width
-            and height are in the extras of each camera.
+        cameras: glTF assumes square pixels and the principal point in the middle; the exact K, width and height are in
+            the extras of each camera.
         light: None for none.
         is_unlit: colours are shown as they are.
     """
-    from trimesh.exchange.gltf import export_glb
-
     graph, base = scene.graph, scene.graph.base_frame
     placed = [(node, *graph.get(node)) for node in graph.nodes_geometry]
     graph.update(frame_from=base, frame_to=TABLE_FRAME, matrix=_Y_UP)
     for node, matrix, geometry in placed:
         graph.update(frame_from=TABLE_FRAME, frame_to=node, matrix=matrix, geometry=geometry)
     for camera in cameras:
-        matrix = camera.T_world_camera.matrix() @ _OPENCV_TO_GLTF
+        matrix = camera.T_world_camera.matrix() @ OPENCV_TO_GLTF
         graph.update(frame_from=TABLE_FRAME, frame_to=camera_node(camera), matrix=matrix)
     if light is not None:
         _add_light(scene, light)
@@ -85,14 +80,20 @@ def glb(
 
 
 def camera_node(camera: Camera) -> str:
-    """The name of a camera's node: that of an object may be the camera's own."""
+    """Name a camera's node: an object may have the camera's own name."""
     return f"camera {camera.name}"
 
 
-def _add_light(scene: trimesh.Scene, light: Light) -> None:
+def light_matrix(light: Light) -> Float[np.ndarray, "4 4"]:
+    """Return `T_world_node` of a light that shines along -z of its node."""
     right, up = orthogonal_basis(light.direction)
     matrix = np.eye(4)
-    matrix[:3] = np.stack([right, up, light.direction, light.position], axis=1)  # it shines along -z of its node
+    matrix[:3] = np.stack([right, up, light.direction, light.position], axis=1)
+    return matrix
+
+
+def _add_light(scene: trimesh.Scene, light: Light) -> None:
+    matrix = light_matrix(light)
     extras = {"gltf_extensions": {LIGHTS_EXTENSION: {"light": 0}}, "ambient": AMBIENT, "diffuse": DIFFUSE}
     scene.graph.update(frame_from=TABLE_FRAME, frame_to=LIGHT_NODE, matrix=matrix, metadata=extras)
     sun = {"type": "directional", "name": LIGHT_NODE, "color": [1.0, 1.0, 1.0], "intensity": DIFFUSE * np.pi}
@@ -100,6 +101,7 @@ def _add_light(scene: trimesh.Scene, light: Light) -> None:
 
 
 def _add_cameras(tree: dict[str, Any], cameras: tuple[Camera, ...]) -> None:
+    """Add the cameras, with their intrinsics, to the nodes that bear their names."""
     if cameras:
         tree["cameras"] = [_camera(camera) for camera in cameras]
     numbers = {camera_node(camera): number for number, camera in enumerate(cameras)}
@@ -108,14 +110,14 @@ def _add_cameras(tree: dict[str, Any], cameras: tuple[Camera, ...]) -> None:
             node["camera"] = numbers[node["name"]]
 
 
-def _camera(camera: Camera) -> Mapping[str, Any]:
+def _camera(camera: Camera) -> dict[str, Any]:
     perspective = {"yfov": camera.fov_y_rad, "aspectRatio": camera.width / camera.height, "znear": _NEAR_M}
     extras = {"K": camera.intrinsics.tolist(), "width": camera.width, "height": camera.height}
     return {"type": "perspective", "name": camera.name, "perspective": perspective, "extras": extras}
 
 
 def _add_materials(tree: dict[str, Any], *, is_unlit: bool) -> None:
-    """Meshes with vertex colours come without a material, and would be polished metal."""
+    """Give meshes with vertex colours a material; without one they would be polished metal."""
     bare = [p for mesh in tree["meshes"] for p in mesh["primitives"] if "material" not in p]
     if not bare:
         return
@@ -129,34 +131,24 @@ def _add_materials(tree: dict[str, Any], *, is_unlit: bool) -> None:
     materials.append(material)
 
 
-# What is seen of a field's surface, one place and one colour per point, for formats without scattering functions.
+# One place and one colour for each point of a field's surface, for formats without scattering functions.
 
-
-_BEFORE_VOXELS, _BEHIND_VOXELS = 2.0, 4.0  # from where to where the surface is looked for
+_BEFORE_VOXELS, _BEHIND_VOXELS = 2.0, 4.0  # limits of the search for the surface
 _LEAST_WEIGHT = 1e-6
 _AT_ONCE = 32768  # points
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Baked:
-    """Points of a surface as cameras see them that look straight at each.
-
-    Attributes:
-        points: at the expected depth, in the field's frame [m].
-        colours: linear radiance in [0, 1].
-    """
-
-    points: Float32[np.ndarray, "P 3"]
-    colours: Float32[np.ndarray, "P 3"]
 
 
 @torch.no_grad()
 def baked(
     field: KiloOSF, points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"], light: Light | None
-) -> Baked:
-    """Where along -n the surface is seen, and in which colour.
+) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3"]]:
+    """Bake the surface as cameras see it that look straight at each point, along -n.
 
         x = p - t n,   c = rho(x, l, -n),   t = sum_i w_i t_i / sum_i w_i,   t_i from -2 to 4 voxels    (eqs. 1, 3)
+
+    A trained field holds its own shadows, but not those of other objects.
+
+    Deviation from eq. 3: the radiance is taken at the expected depth, not integrated along the ray.
 
     Args:
         field: of the object.
@@ -165,9 +157,8 @@ def baked(
         light: toward it, in the field's frame; None for one that falls along each point's own normal, under which
             ambient + diffuse = 1: c is then the albedo, as in `osfcore.photo.pose_loss`.
 
-    A trained field holds its own shadows; those of others are not there.
-
-    Deviation from eq. 3: the radiance is taken at the expected depth, not integrated along the ray.
+    Returns:
+        Points x in the field's frame [m], and linear radiance c in [0, 1].
     """
     query = KiloQuery(field)
     t = torch.arange(-_BEFORE_VOXELS, _BEHIND_VOXELS, STEP_VOXELS) * query.voxel
@@ -182,14 +173,12 @@ def baked(
         seen = p - depth * n
         scatter = query(seen, toward, -n)
         parts.append(torch.stack([seen, (scatter.ambient + scatter.direct).clamp(0, 1)]).numpy())
-    return Baked(*np.concatenate(parts, axis=1))
-
-
-# The surface of a field as a mesh with a colour for each vertex.
+    places, colours = np.concatenate(parts, axis=1)
+    return places, colours
 
 
 def coloured_mesh(field: KiloOSF, light: Light | None = None) -> trimesh.Trimesh:
-    """Where the density is that of a surface (marching cubes), in the field's frame [m].
+    """Mesh a field's surface by marching cubes, in its frame [m], with a colour for each vertex.
 
     Args:
         field: of the object.
@@ -198,27 +187,22 @@ def coloured_mesh(field: KiloOSF, light: Light | None = None) -> trimesh.Trimesh
     Raises:
         InvalidInput: if nothing in the field is solid.
     """
-    import trimesh
-    from trimesh.visual import ColorVisuals
-
     vertices, faces = field_mesh(field)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    colours = baked(field, vertices, np.array(mesh.vertex_normals), light).colours
+    _, colours = baked(field, vertices, np.array(mesh.vertex_normals), light)
     mesh.visual = ColorVisuals(mesh, vertex_colors=to_uint8(linear_of_srgb(colours)))
     return mesh
 
 
 def field_meshes(field: KiloOSF, name: str, light: Light | None = None) -> trimesh.Scene:
-    """The coloured mesh, named, as exporters take it; arguments and errors as of `field_glb`."""
-    import trimesh
-
+    """Name the coloured mesh, for exporters; arguments and errors as of `field_glb`."""
     scene = trimesh.Scene()
     scene.add_geometry(coloured_mesh(field, light), node_name=name, geom_name=name)
     return scene
 
 
 def field_glb(field: KiloOSF, name: str, light: Light | None = None) -> bytes:
-    """A field as binary glTF with vertex colours (see `osfcore.export.meshes` for axes and colours).
+    """Encode a field's surface as binary glTF with vertex colours.
 
     Args:
         field: of the object.
@@ -232,14 +216,13 @@ def field_glb(field: KiloOSF, name: str, light: Light | None = None) -> bytes:
     return glb(field_meshes(field, name, light), is_unlit=light is not None)
 
 
-# A scene as meshes that other programs take: objects, table, pusher.
-
+# A scene as meshes: objects, table, pusher.
 
 TABLE_NODE, PUSHER_NODE = "table", "pusher"
 
 
 def scene_meshes(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table: TableField) -> trimesh.Scene:
-    """Everything where it stands, z up [m].
+    """Place all meshes of a scene, z up [m].
 
     Nodes bear the names of the objects; the others are "table" and "pusher", and an object of that name has "object "
     before its own.
@@ -253,8 +236,6 @@ def scene_meshes(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], tab
     Raises:
         InvalidInput: if nothing in a field is solid.
     """
-    import trimesh
-
     meshes = trimesh.Scene()
     _add(meshes, TABLE_NODE, _table_mesh(table), Pose.identity())
     if scene.state.pusher is not None:
@@ -268,7 +249,7 @@ def scene_meshes(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], tab
 
 
 def object_node(name: str) -> str:
-    """The name of an object's node."""
+    """Name an object's node."""
     return f"object {name}" if name in (TABLE_NODE, PUSHER_NODE) else name
 
 
@@ -277,7 +258,7 @@ def _add(scene: trimesh.Scene, node: str, mesh: trimesh.Trimesh, pose: Pose) -> 
 
 
 def _table_mesh(table: TableField) -> trimesh.Trimesh:
-    """Two triangles; the albedo's outermost points lie on the table's edge, half a texel inside the texture."""
+    """Build two triangles; the albedo's outermost points lie on the table's edge, half a texel inside the texture."""
     half, inset = table.half_side, 0.5 / len(table.albedo)
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     vertices = np.column_stack([half * corners, np.zeros(4)]).astype(np.float32)
@@ -290,9 +271,6 @@ def _table_mesh(table: TableField) -> trimesh.Trimesh:
 
 
 def _pusher_mesh() -> trimesh.Trimesh:
-    import trimesh
-    from trimesh.visual import ColorVisuals
-
     mesh = trimesh.creation.cylinder(PUSHER_RADIUS_M, PUSHER_HEIGHT_M, sections=48)
     mesh.unmerge_vertices()  # its edges are sharp
     colours = np.tile(to_uint8(linear_of_srgb(np.array(PUSHER_ALBEDO))), (len(mesh.vertices), 1))
@@ -300,11 +278,8 @@ def _pusher_mesh() -> trimesh.Trimesh:
     return mesh
 
 
-# A scene as binary glTF: objects, table, pusher, cameras and the light, for Blender, game engines and browsers.
-
-
 def scene_glb(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table: TableField) -> bytes:
-    """The scene under its light; see `osfcore.export.meshes` for axes, colours, light and cameras.
+    """Encode a scene with its cameras and light as binary glTF, for Blender, game engines and browsers.
 
     Nodes bear the names that `scene_meshes` gives, "light", and "camera NAME".
 

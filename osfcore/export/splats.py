@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from jaxtyping import Float32
 from scipy.spatial import KDTree
 
@@ -55,10 +56,10 @@ class Splats:
 
 
 def field_splats(field: KiloOSF, light: Light) -> Splats:
-    """Discs where the field is seen below the vertices of its surface, each triangle of which is cut into four.
+    """Place a disc below each vertex of the field's surface, after each of its triangles is cut into four.
 
-    Colours are the radiance seen along the normal: splats of degree 0 do not change with the view, nor any with the
-    light. Discs are as wide as the mean distance to the six nearest neighbours asks for, much as Kerbl et al. begin.
+    Colours are the radiance along the normal: splats of degree 0 change neither with the view nor with the light. The
+    width of a disc follows the mean distance to its six nearest neighbours, as in the initialization of Kerbl et al.
 
     Args:
         field: of the object.
@@ -67,17 +68,15 @@ def field_splats(field: KiloOSF, light: Light) -> Splats:
     Raises:
         InvalidInput: if nothing in the field is solid.
     """
-    import trimesh
-
     mesh = trimesh.Trimesh(*field_mesh(field), process=False).subdivide()
     normals = np.array(mesh.vertex_normals)
-    seen = baked(field, np.array(mesh.vertices), normals, light)
-    distances, _ = KDTree(seen.points).query(seen.points, k=_NEIGHBOURS + 1)
+    points, colours = baked(field, np.array(mesh.vertices), normals, light)
+    distances, _ = KDTree(points).query(points, k=_NEIGHBOURS + 1)
     spacing = distances[:, 1:].mean(axis=1, keepdims=True)
     return Splats(
-        seen.points,
+        points,
         normals.astype(np.float32),
-        seen.colours,
+        colours,
         (spacing * (_WIDTH, _WIDTH, _THICKNESS)).astype(np.float32),
         _from_z(normals),
         _OPACITY,
@@ -86,14 +85,14 @@ def field_splats(field: KiloOSF, light: Light) -> Splats:
 
 
 def _from_z(normals: np.ndarray) -> Float32[np.ndarray, "S 4"]:
-    """The shortest rotations from z to unit vectors: (1 + n_z, -n_y, n_x, 0), brought to length 1."""
+    """Return the shortest rotations from z to unit vectors: (1 + n_z, -n_y, n_x, 0), normalized."""
     q = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1)
     q[normals[:, 2] < -1 + 1e-6] = (0, 1, 0, 0)  # straight down: half a turn about x
     return (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
 
 
 def splats_ply(splats: Splats) -> bytes:
-    """A binary PLY; its comments say under which light the colours are."""
+    """Encode a binary PLY; its comments name the light that is baked in."""
     x, y, z = splats.light.direction
     header = (
         "ply",

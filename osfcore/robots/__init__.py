@@ -1,1 +1,1 @@
-"""Robots over the wire as worlds, and what stands between a plan and a motor: limits, a stop, a question before."""
+"""Robots over HTTP and ROS as worlds, with limits, a stop and a permission before the first motion."""

@@ -15,15 +15,15 @@ _ROS_NAMES = ("cameras", "image", "info", "twist", "table", "pusher")
 
 
 def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None = None) -> Robot:
-    """The robot at an address.
+    """Connect to the robot at an address.
 
     Args:
-        url: of one that speaks HTTP, or of rosbridge with the names of ROS in its query (`RosNames`).
+        url: of a robot over HTTP, or of rosbridge with the names of ROS in its query (`RosNames`).
         names: of the objects on the table.
-        limits: of one under ROS, which tells none; the usual ones if None.
+        limits: of a robot under ROS, which has no message for them; the usual ones if None.
 
     Raises:
-        InvalidInput, UnknownName: if it is no such address.
+        InvalidInput, UnknownName: if the address is malformed.
         MissingExtra: if a package for ROS is not installed.
         ConnectionLost: if nobody answers.
         RobotRefused: if what answers is no robot.
@@ -45,10 +45,10 @@ def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None =
 
 
 def check_address(url: str) -> SplitResult:
-    """The parts of a robot's address.
+    """Split a robot's address into its parts.
 
     Raises:
-        InvalidInput: if it is no such address.
+        InvalidInput: if the address is malformed.
     """
     try:
         parts = urlsplit(url)

@@ -1,4 +1,4 @@
-"""A world whose pusher keeps within limits, asks before it moves for the first time, and can be stopped at any time."""
+"""A world whose pusher stays within limits, asks before its first motion, and can be stopped at any time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from osfcore.io.image_file import to_uint8
 from osfcore.photo.segmentation import Box, propose_masks
 from osfcore.robots.robot import RobotStopped, SafetyLimits, Stoppable, Whereabouts
 
-_OVERSHOT_M = 0.01  # so far outside the box the pusher may have come by itself, and returns
+_OVERSHOT_M = 0.01  # a pusher may have come so far outside the box by itself, and returns
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -27,8 +27,8 @@ class HeldBack:
     """An action that a wall of the box cut short.
 
     Attributes:
-        action: as it was wanted [m/s].
-        done: what was done of it, as a velocity held for as long [m/s].
+        action: as asked for [m/s].
+        done: the part that was done, as a velocity held for as long [m/s].
     """
 
     action: Float[np.ndarray, "3"]
@@ -36,19 +36,17 @@ class HeldBack:
 
 
 class GuardedWorld:
-    """Wraps any `World`.
+    """A wrapper of any `World` that enforces limits.
 
-    What exceeds the top speed is done slower, for longer: the way stays the same. What leads out of the box ends at its
-    wall. Between two looks the pusher is taken to be anywhere that its actions can have brought it, and no such place
-    is outside.
+    An action above the top speed is done slower, for longer, along the same path. A path out of the box ends at its
+    wall. Between two observations the pusher may be wherever its actions can have brought it; no such place is outside.
 
-    The robot is told to stop by `stop`, by `close`, and by whatever goes wrong while it looks or moves. After that
-    `act` only raises `RobotStopped`.
+    `stop`, `close` and any error while the robot looks or moves stop it. After that `act` only raises `RobotStopped`.
 
     Args:
-        world: that is moved; told to start and stop if it is `Stoppable`.
+        world: that is moved; started and stopped if it is `Stoppable`.
         limits: for the pusher.
-        permit: asked once, before the first motion; nothing moves unless it says yes.
+        permit: asked once, before the first motion; nothing moves unless it returns True.
     """
 
     def __init__(self, world: World, limits: SafetyLimits, permit: Callable[[], bool] | None = None) -> None:
@@ -65,45 +63,40 @@ class GuardedWorld:
         """Actions that were cut short so far."""
         return tuple(self._held_back)
 
-    @property
-    def is_stopped(self) -> bool:
-        """Whether nothing will move any more."""
-        return self._stopped.is_set()
-
     def check(self) -> None:
-        """Let a stop be known.
+        """Raise if the robot was stopped.
 
         Raises:
-            RobotStopped: if it was stopped.
+            RobotStopped: if so.
         """
         if self._stopped.is_set():
             raise RobotStopped(self._reason)
 
     def stop(self, reason: str) -> None:
-        """Stop the robot for good; from any thread, and as often as one likes.
+        """Stop the robot for good; from any thread, any number of times.
 
         Args:
             reason: why, as the end of the sentence "The robot was stopped: ...".
         """
         with self._lock:
             self._reason = self._reason or reason
-        self._stopped.set()  # before the robot is told: whoever is about to send an action sees it
-        self._tell_to_stop()
+        self._stopped.set()  # before the robot is stopped: a thread about to send an action sees it
+        self._stop_world()
 
     # The World protocol
 
     def reset(self, seed: int) -> Observation:
-        """As the wrapped world does it."""
+        """Reset the wrapped world."""
         with self._halted_by_errors():
             return self._seen(self._world.reset(seed))
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """As the wrapped world sees it; also after a stop."""
+        """Observe the wrapped world; also after a stop."""
         with self._halted_by_errors():
             return self._seen(self._world.observe(masks=masks))
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
-        """Do what the limits leave of an action.
+        """Do as much of an action as the limits allow.
 
         Raises:
             InvalidInput: if it is no action, or the pusher's place is unknown or well outside the box; nothing moves.
@@ -112,7 +105,12 @@ class GuardedWorld:
         action = check_action(action)
         wanted = action[:2] * STEP_S
         self.check()
-        where = self._checked_place()
+        where = self._where
+        if where is None:
+            raise InvalidInput("place of the pusher", "unknown", "told by the robot before it is moved")
+        if self._limits.outside_m(where) > _OVERSHOT_M:
+            allowed = f"within {self._limits.box}, the safety box; move it there by hand, or allow a larger box"
+            raise InvalidInput("place of the pusher [m]", np.round(where.low, 3).tolist(), allowed)
         travel = self._limits.allowed_travel(wanted, where)
         if not np.allclose(travel, wanted, atol=1e-6):
             self._held_back.append(HeldBack(action, np.array([*(travel / STEP_S), 0.0])))
@@ -134,15 +132,8 @@ class GuardedWorld:
         self._where = None if observation.pusher is None else Whereabouts.at(observation.pusher)
         return observation
 
-    def _checked_place(self) -> Whereabouts:
-        if self._where is None:
-            raise InvalidInput("place of the pusher", "unknown", "told by the robot before it is moved")
-        if self._limits.outside_m(self._where) > _OVERSHOT_M:
-            allowed = f"within {self._limits.box}, the safety box; move it there by hand, or allow a larger box"
-            raise InvalidInput("place of the pusher [m]", np.round(self._where.low, 3).tolist(), allowed)
-        return self._where
-
     def _begin(self) -> None:
+        """Ask for permission and start the robot, once."""
         if self._is_started:
             return
         if self._permit is not None and not self._permit():
@@ -153,51 +144,47 @@ class GuardedWorld:
             with self._halted_by_errors():
                 self._world.start()
             if self._stopped.is_set():  # meanwhile, and the start came after it
-                self._tell_to_stop()
+                self._stop_world()
 
     @contextlib.contextmanager
     def _halted_by_errors(self) -> Iterator[None]:
-        """Whatever goes wrong, an interruption by the keyboard included, stops what may be moving."""
+        """Stop the robot on any error, also on an interruption by the keyboard."""
         try:
             yield
         except BaseException as error:
             was_stopped = self._stopped.is_set()
             if self._is_started:
                 self.stop(str(error) or "it was interrupted")
-            if was_stopped and isinstance(error, OsfError):  # it refuses what came too late
+            if was_stopped and isinstance(error, OsfError):  # a stopped robot refuses late commands
                 raise RobotStopped(self._reason) from error
             raise
 
-    def _tell_to_stop(self) -> None:
+    def _stop_world(self) -> None:
         if isinstance(self._world, Stoppable):
             with contextlib.suppress(OsfError):  # one that cannot be reached halts by itself
                 self._world.stop()
 
 
-# Masks of the first look for worlds that have none: a person draws a box around each object, GrabCut its outline.
-
+# Masks of the first observation for worlds without: a person draws a box around each object, GrabCut its outline.
 
 CameraBoxes = Mapping[str, Mapping[str, Box]]
 
 
 class OutlinedWorld:
-    """Wraps a world; where that has no masks, boxes tell what they are.
+    """A wrapper of a world without masks, which takes them from boxes.
 
     Args:
         world: that looks and moves.
-        boxes: by names of camera and object, x0, y0, x1, y1 [px] of what `observe` delivers. Cameras in which an object
-            has none are left out of looks with masks: no mask would mean that it is not visible there.
+        boxes: by names of camera and object, x0, y0, x1, y1 [px] of the images of `observe`. Cameras in which an object
+            has none are left out of observations with masks: no mask would mean that it is not visible there.
     """
 
     def __init__(self, world: World, boxes: CameraBoxes) -> None:
         self._world, self._boxes = world, boxes
-
-    def reset(self, seed: int) -> Observation:
-        """As the wrapped world does it."""
-        return self._world.reset(seed)
+        self.reset, self.act, self.close = world.reset, world.act, world.close
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """As the wrapped world sees it, with outlines on demand.
+        """Observe the wrapped world, with outlines on demand.
 
         Raises:
             UnknownName: if a box is in no camera, or around no object, that there is.
@@ -205,14 +192,6 @@ class OutlinedWorld:
         """
         seen = self._world.observe(masks=masks)
         return self._outlined(seen) if masks and seen.masks is None else seen
-
-    def act(self, action: Float[np.ndarray, "3"]) -> None:
-        """As the wrapped world does it."""
-        self._world.act(action)
-
-    def close(self) -> None:
-        """Release what the wrapped world holds."""
-        self._world.close()
 
     def _outlined(self, seen: Observation) -> Observation:
         cameras = [camera.name for camera in seen.cameras]
@@ -236,7 +215,7 @@ class OutlinedWorld:
 def _outlines(
     picture: UInt8[np.ndarray, "h w 3"], boxes: Mapping[str, Box], names: tuple[str, ...]
 ) -> Bool[np.ndarray, "N h w"]:
-    """GrabCut from each box, a click in its middle telling what is the object, and what is none of the others."""
+    """Run GrabCut from each box; a click in its middle marks the object, and background of the others."""
     clicks = {name: np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]) for name, (x0, y0, x1, y1) in boxes.items()}
     found = propose_masks(picture, boxes, clicks)
     return np.stack([found[name] for name in names])

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
@@ -29,8 +28,7 @@ from osfcore.photo.read_photograph import KEPT_SIDE as MOST_SIDE
 from osfcore.photo.read_photograph import read_photograph
 from osfcore.robots.robot import ConnectionLost, RobotDescription, RobotRefused, SafetyLimits
 
-# Pictures as a robot's cameras encode them, made what an `Observation` holds: linear radiance of moderate size.
-
+# From encoded pictures of a robot's cameras to linear radiance of moderate size, as an `Observation` holds it.
 
 KEPT_SIDE = 640  # larger pictures are reduced to this; estimates look at less
 
@@ -40,12 +38,12 @@ class SentCamera:
     """A camera as a robot describes it: of any image size.
 
     Attributes:
-        name: how it is called.
-        T_world_camera: its place over the table.
+        name: of the camera.
+        T_world_camera: its pose over the table.
         intrinsics: K of the pictures that are sent, pixel centres at +0.5 [px].
-        width: of these [px].
-        height: of these [px].
-        distortion: coefficients of OpenCV's model; none where straight lines are straight.
+        width: of the pictures that are sent [px].
+        height: of the pictures that are sent [px].
+        distortion: coefficients of OpenCV's model; none for a pinhole camera.
     """
 
     name: str
@@ -56,7 +54,7 @@ class SentCamera:
     distortion: tuple[float, ...] = ()
 
     def kept(self) -> Camera:
-        """The camera of the pictures as they are kept.
+        """Return the camera of the pictures as they are kept.
 
         Raises:
             InvalidInput: if its values are out of range.
@@ -70,37 +68,35 @@ class SentCamera:
         return Camera(self.name, self.T_world_camera, self.intrinsics * ratio, width, height)
 
     def radiance(self, picture: bytes) -> Float32[np.ndarray, "h w 3"]:
-        """A JPEG or PNG file of this camera, sRGB, as linear radiance through `kept`.
+        """Decode a JPEG or PNG file of this camera, sRGB, into linear radiance as `kept` sees it.
 
         Raises:
             CorruptFile: if it is no such file.
             InvalidInput: if it has another size than was described.
         """
         encoded = read_photograph(picture).encoded
-        self._check_size(encoded.shape[:2])
-        linear = linear_from_encoded(encoded / np.iinfo(encoded.dtype).max, "srgb").astype(np.float32)
-        return self._reduced(self._straight(linear), cv2.INTER_AREA)
+        return self._resample(linear_from_encoded(encoded / np.iinfo(encoded.dtype).max, "srgb").astype(np.float32))
 
     def mask(self, picture: bytes) -> Bool[np.ndarray, "h w"]:
-        """A mask of this camera, more than 127 being the object."""
-        grey = read_photograph(picture).eight_bit[..., 0].astype(np.float32)
-        self._check_size(grey.shape)
-        return self._reduced(self._straight(grey), cv2.INTER_AREA) > 127
+        """Decode a mask of this camera; values above 127 are the object.
 
-    def _check_size(self, shape: tuple[int, ...]) -> None:
-        if shape != (self.height, self.width):
+        Raises:
+            CorruptFile, InvalidInput: as `radiance`.
+        """
+        return self._resample(read_photograph(picture).eight_bit[..., 0].astype(np.float32)) > 127
+
+    def _resample(self, image: np.ndarray) -> np.ndarray:
+        """Undistort an image and reduce it to the size of `kept`."""
+        if image.shape[:2] != (self.height, self.width):
             what = f"picture of camera {shown(self.name)} [px]"
-            raise InvalidInput(what, f"{shape[1]} x {shape[0]}", f"{self.width} x {self.height}, as the robot tells")
-
-    def _straight(self, image: np.ndarray) -> np.ndarray:
-        if not any(self.distortion):
-            return image
-        K = self.intrinsics - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV's pixel centres are whole
-        return cv2.undistort(image, K, np.array(self.distortion))
-
-    def _reduced(self, image: np.ndarray, how: int) -> np.ndarray:
-        size = (self.kept().width, self.kept().height)
-        return image if size == (self.width, self.height) else cv2.resize(image, size, interpolation=how)
+            given = f"{image.shape[1]} x {image.shape[0]}"
+            raise InvalidInput(what, given, f"{self.width} x {self.height}, as the robot tells")
+        if any(self.distortion):
+            K = self.intrinsics - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV's pixel centres are whole
+            image = cv2.undistort(image, K, np.array(self.distortion))
+        kept = self.kept()
+        size = (kept.width, kept.height)
+        return image if size == (self.width, self.height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def observation_of(
@@ -111,19 +107,19 @@ def observation_of(
     time_s: float,
     masks: Mapping[tuple[str, str], bytes] | None = None,
 ) -> Observation:
-    """Everything that was sent, as an observation.
+    """Decode all that a robot sent into an observation.
 
     Args:
         cameras: that took the pictures.
-        pictures: one of each, as files.
-        names: of the objects, which the owner tells.
+        pictures: one file of each camera.
+        names: of the objects, given by the owner.
         pusher: its centre [m].
-        time_s: since the first one [s].
-        masks: files by names of camera and object, where the robot has them; what is left out is not visible.
+        time_s: since the robot was connected [s].
+        masks: files by names of camera and object; objects without a file are not visible. None without masks.
 
     Raises:
-        CorruptFile: if one is no picture.
-        InvalidInput: if one has another size than was described, or the cameras differ in size.
+        CorruptFile: if a file is no picture.
+        InvalidInput: if a picture has another size than was described, or the cameras differ in size.
     """
     kept = tuple(camera.kept() for camera in cameras)
     sizes = sorted({f"{camera.width} x {camera.height}" for camera in kept})
@@ -141,14 +137,14 @@ def observation_of(
 
 
 class LimitsJson(Entry):
-    """Limits that a robot keeps itself."""
+    """Limits that a robot keeps by itself."""
 
     box: Vector4 = Field(description="x0, y0, x1, y1 of the pusher's centre [m].")
     top_speed_m_s: FiniteFloat
 
 
 class RobotJson(Entry):
-    """What GET /robot answers."""
+    """Answer of GET /robot."""
 
     cameras: list[CameraJson] = Field(min_length=1)
     limits: LimitsJson
@@ -158,17 +154,17 @@ class RobotJson(Entry):
 
 
 class HttpRobot:
-    """One robot; a `Robot`. `description` is what it says of itself.
+    """A `Robot` over HTTP; `description` is what it says of itself.
 
     Args:
-        url: where it is, such as http://192.168.0.7:8080.
-        names: of the objects on the table, which a person tells.
+        url: its address, such as http://192.168.0.7:8080.
+        names: of the objects on the table, given by a person.
         timeout_s: how long an answer may take beyond the time that a motion takes [s].
 
     Raises:
         ConnectionLost: if nobody answers.
         RobotRefused: if something else than a robot answers.
-        InvalidInput: if what it says of itself is out of range.
+        InvalidInput: if its description is out of range.
     """
 
     def __init__(self, url: str, names: tuple[str, ...], timeout_s: float = 5.0) -> None:
@@ -177,43 +173,49 @@ class HttpRobot:
         self._http = httpx2.Client(timeout=timeout_s, trust_env=False)
         self._idle, self._under_way = threading.Condition(), 0
         try:
-            told = decode(RobotJson, self._json("GET", "robot"), f"answer of {self._url}/robot")
-            self._cameras = tuple(_camera(entry) for entry in told.cameras)
-            limits = SafetyLimits((*told.limits.box,), told.limits.top_speed_m_s)  # pyright: ignore[reportArgumentType]
+            answer = decode(RobotJson, self._json("GET", "robot"), f"answer of {self._url}/robot")
+            self._cameras = tuple(
+                SentCamera(c.name, rigid_pose(c.T_world_camera, c.name), np.array(c.K), c.width, c.height)
+                for c in answer.cameras
+            )
+            limits = SafetyLimits((*answer.limits.box,), answer.limits.top_speed_m_s)  # pyright: ignore[reportArgumentType]
             cameras = tuple(camera.kept() for camera in self._cameras)
-            masks = frozenset(told.masks)
-            self.description = RobotDescription(cameras, limits, told.pusher_radius_m, told.deadman_s, masks)
+            masks = frozenset(answer.masks)
+            self.description = RobotDescription(cameras, limits, answer.pusher_radius_m, answer.deadman_s, masks)
         except OsfError:
             self.close()
             raise
         self._began = time.monotonic()
 
     def reset(self, seed: int) -> Observation:
-        """Only look: what lies on the table is a person's business."""
+        """Observe: a person arranges the table."""
         return self.observe()
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """A picture of every camera; masks of all objects if the robot has them.
+        """Take a picture with every camera; masks of all objects if the robot has them.
 
         Raises:
             ConnectionLost: if nobody answers.
-            RobotRefused: if it does not want to.
-            CorruptFile, InvalidInput: if what it sends is not what it should be.
+            RobotRefused: if the robot refuses.
+            CorruptFile, InvalidInput: if an answer is malformed.
         """
         pusher = decode(PointJson, self._json("GET", "pusher"), f"answer of {self._url}/pusher").position
         pictures = self.pictures()
-        sent = self._masks() if masks and self.description.masks.issuperset(self._names) else None
+        sent = None
+        if masks and self.description.masks.issuperset(self._names):
+            keys = [(camera.name, name) for camera in self._cameras for name in self._names]
+            sent = {key: self._answer("GET", "masks/" + "/".join(map(_quoted, key))) for key in keys}
         seconds = time.monotonic() - self._began
         return observation_of(self._cameras, pictures, self._names, np.array(pusher), seconds, sent)
 
     def pictures(self) -> tuple[bytes, ...]:
-        """A picture of every camera, as the robot sends it.
+        """Return a picture file of every camera, as the robot sends it.
 
         Raises:
             ConnectionLost: if nobody answers.
-            RobotRefused: if it does not want to.
+            RobotRefused: if the robot refuses.
         """
-        return tuple(self._bytes(f"images/{quote(camera.name, safe='')}") for camera in self._cameras)
+        return tuple(self._answer("GET", f"images/{_quoted(camera.name)}") for camera in self._cameras)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
         """Hold a velocity for 0.2 s; the robot answers when that is over.
@@ -221,7 +223,7 @@ class HttpRobot:
         Raises:
             InvalidInput: if it is no action.
             ConnectionLost: if nobody answers.
-            RobotRefused: if it does not want to, such as after a stop.
+            RobotRefused: if the robot refuses, such as after a stop.
         """
         velocity = check_action(action)[:2].tolist()
         self._json("POST", "act", {"velocity": velocity, "duration_s": STEP_S})
@@ -237,15 +239,11 @@ class HttpRobot:
     def close(self) -> None:
         """Wait for requests under way, such as a stop from another thread, then release the sockets.
 
-        Timeouts bound the wait. Closing at once would abort a stop, and leak the socket of one that still connects.
+        Timeouts bound the wait. Closing at once would abort a stop, or leak the socket of one that still connects.
         """
         with self._idle:
             self._idle.wait_for(lambda: not self._under_way)
             self._http.close()
-
-    def _masks(self) -> dict[tuple[str, str], bytes]:
-        keys = [(camera.name, name) for camera in self._cameras for name in self._names]
-        return {key: self._bytes("masks/" + "/".join(quote(part, safe="") for part in key)) for key in keys}
 
     def _json(self, method: str, path: str, body: object = None) -> Any:  # noqa: ANN401
         content = self._answer(method, path, body)
@@ -254,37 +252,28 @@ class HttpRobot:
         except ValueError:
             raise RobotRefused(self._url, f"something that is no JSON to {method} /{path}") from None
 
-    def _bytes(self, path: str) -> bytes:
-        return self._answer("GET", path)
-
     def _answer(self, method: str, path: str, body: object = None) -> bytes:
-        try:
-            with self._one_more_under_way():
-                answer = self._http.request(method, f"{self._url}/{path}", json=body)
-        except (httpx2.TransportError, httpx2.InvalidURL, RuntimeError) as error:  # RuntimeError once it is closed
-            raise ConnectionLost(self._url, str(error) or type(error).__name__) from error
-        if not answer.is_success:
-            raise RobotRefused(self._url, _detail(answer) or f"{answer.status_code} to {method} /{path}")
-        return answer.content
-
-    @contextlib.contextmanager
-    def _one_more_under_way(self) -> Iterator[None]:
         with self._idle:
             self._under_way += 1
         try:
-            yield
+            answer = self._http.request(method, f"{self._url}/{path}", json=body)
+        except (httpx2.TransportError, httpx2.InvalidURL, RuntimeError) as error:  # RuntimeError once it is closed
+            raise ConnectionLost(self._url, str(error) or type(error).__name__) from error
         finally:
             with self._idle:
                 self._under_way -= 1
                 self._idle.notify_all()
+        if not answer.is_success:
+            raise RobotRefused(self._url, _detail(answer) or f"{answer.status_code} to {method} /{path}")
+        return answer.content
 
 
-def _camera(entry: CameraJson) -> SentCamera:
-    pose: Pose = rigid_pose(entry.T_world_camera, entry.name)
-    return SentCamera(entry.name, pose, np.array(entry.K), entry.width, entry.height)
+def _quoted(name: str) -> str:
+    return quote(name, safe="")
 
 
 def _detail(answer: httpx2.Response) -> str:
+    """Return the reason that an answer gives for a failure, or nothing."""
     try:
         detail = answer.json()["detail"]
     except (ValueError, KeyError, TypeError):

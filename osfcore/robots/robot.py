@@ -13,10 +13,7 @@ from osfcore.errors import InvalidInput, OsfError, check_ranges, finite_vector
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.workspace import PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S
 
-# Where a pusher may be and how fast it may go, and what of an action these limits leave.
-#
-# Frame: the table's; z up, the table's centre the origin.
-
+# Limits of the pusher, in the table's frame: z up, the origin at the table's centre.
 
 MIN_SPEED_M_S, TOP_SPEED_M_S = 0.005, 5.0  # a robot may be able to do more than any action asks
 _BOX = "x0, y0, x1, y1, finite, with x0 < x1 and y0 < y1"
@@ -47,7 +44,7 @@ class SafetyLimits:
         object.__setattr__(self, "box", (x0, y0, x1, y1))
 
     def within(self, other: SafetyLimits) -> SafetyLimits:
-        """Both limits at once: the common part of the boxes, and the lower speed.
+        """Combine two limits: the common part of the boxes, and the lower speed.
 
         Raises:
             InvalidInput: if the boxes have nothing in common.
@@ -59,12 +56,12 @@ class SafetyLimits:
         return SafetyLimits(box, min(self.top_speed_m_s, other.top_speed_m_s))
 
     def outside_m(self, where: Whereabouts) -> float:
-        """How far outside the box the pusher may be [m]; 0 inside."""
+        """Return how far outside the box the pusher may be [m]; 0 inside."""
         low, high = np.reshape(self.box, (2, 2))
         return float(max(0.0, (low - where.low).max(), (where.high - high).max()))
 
     def allowed_travel(self, travel: Float[np.ndarray, "2"], where: Whereabouts) -> Float[np.ndarray, "2"]:
-        """What of a travel the box leaves: it ends at a wall, and goes on along it.
+        """Clip a travel to the box: it ends at a wall, and goes on along it.
 
         Per axis, as the simulated pusher stops at the border of its reach:
 
@@ -72,16 +69,16 @@ class SafetyLimits:
 
         Args:
             travel: of the pusher [m].
-            where: it is.
+            where: the pusher is.
         """
         low, high = np.reshape(self.box, (2, 2))
         most, least = np.maximum(high - where.high, 0), np.minimum(low - where.low, 0)
         return np.clip(travel, least, most)
 
     def slow_parts(self, travel: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "3"]]:
-        """Velocities (vx, vy, 0) [m/s] that are allowed, each held for `STEP_S`, and cover a travel [m] together.
+        """Split a travel [m] into allowed velocities (vx, vy, 0) [m/s], each held for `STEP_S`.
 
-        Slower for longer: pushes are so slow that only the way counts, so predictions of the action still hold.
+        Pushes are so slow that only the path counts. So predictions of the action also hold for slower, longer parts.
         """
         speed = float(np.linalg.norm(travel)) / STEP_S
         count = max(1, int(np.ceil(speed / self.top_speed_m_s - 1e-9)))
@@ -90,7 +87,7 @@ class SafetyLimits:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Whereabouts:
-    """A rectangle that the pusher's centre is in for sure, however much of what it was told it has done.
+    """A rectangle that holds the pusher's centre, however much of its commands it has done.
 
     Attributes:
         low: least x and y [m].
@@ -102,16 +99,15 @@ class Whereabouts:
 
     @staticmethod
     def at(position: Float[np.ndarray, "3"]) -> Whereabouts:
-        """Where it was measured."""
+        """Return the point where the pusher was measured."""
         return Whereabouts(position[:2].astype(float), position[:2].astype(float))
 
     def after(self, travel: Float[np.ndarray, "2"]) -> Whereabouts:
-        """After a travel [m] of which nobody knows how much came about: what it met may have held it."""
+        """Extend the rectangle by a travel [m], any share of which may have been done: objects may hold the pusher."""
         return Whereabouts(self.low + np.minimum(travel, 0), self.high + np.maximum(travel, 0))
 
 
-# What a robot must offer besides a `World`: that it can be started and stopped; what it says of itself; its errors.
-
+# What a robot offers besides a `World`: start and stop, a description, errors.
 
 LONGEST_DEADMAN_S = 1.0
 
@@ -125,6 +121,7 @@ class RobotStopped(OsfError):
 
     def __init__(self, reason: str) -> None:
         super().__init__(f"The robot was stopped: {reason.rstrip('.')}.")
+        self.reason = reason
 
 
 class ConnectionLost(OsfError):
@@ -136,12 +133,13 @@ class ConnectionLost(OsfError):
     """
 
     def __init__(self, url: str, reason: str) -> None:
-        told = f"The robot at {url} does not answer ({reason.rstrip('.')})"
-        super().__init__(f"{told}; if it moved, it halts by itself. See whether it runs and is on the network.")
+        lost = f"The robot at {url} does not answer ({reason.rstrip('.')})"
+        super().__init__(f"{lost}; if it moved, it halts by itself. See whether it runs and is on the network.")
+        self.url, self.reason = url, reason
 
 
 class RobotRefused(OsfError):
-    """What a robot answers to something that it does not do, or an answer that nobody understands.
+    """A robot's answer to a request that it refuses, or an answer that cannot be read.
 
     Args:
         url: of the robot.
@@ -150,16 +148,17 @@ class RobotRefused(OsfError):
 
     def __init__(self, url: str, reason: str) -> None:
         super().__init__(f"The robot at {url} says: {reason.rstrip('.')}.")
+        self.url, self.reason = url, reason
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RobotDescription:
-    """What a robot says of itself.
+    """A robot's description of itself.
 
     Attributes:
-        cameras: that it has, with their places over the table.
-        limits: that it keeps itself.
-        pusher_radius_m: of its hand, a vertical cylinder [m].
+        cameras: with their poses over the table.
+        limits: that it keeps by itself.
+        pusher_radius_m: of its pusher, a vertical cylinder [m].
         deadman_s: without a new command it halts after this time [s].
         masks: objects whose masks it delivers.
     """
@@ -184,25 +183,25 @@ class RobotDescription:
 
 @runtime_checkable
 class Stoppable(Protocol):
-    """What moves by itself and can be told not to."""
+    """Something that moves by itself and can be stopped."""
 
     def start(self) -> None:
         """Make ready to move, after a stop or for the first time; nothing moves yet."""
         ...
 
     def stop(self) -> None:
-        """Halt at once and stay so until `start`; from any thread, also while another one waits in `act`."""
+        """Halt at once until `start`; from any thread, also while another one waits in `act`."""
         ...
 
 
 class Robot(World, Stoppable, Protocol):
-    """A world of motors: `reset` only looks, for what lies on the table is a person's business."""
+    """A real world: `reset` only observes, for a person arranges the table."""
 
     @property
     def description(self) -> RobotDescription:
-        """What the robot says of itself."""
+        """The robot's description of itself."""
         ...
 
     def pictures(self) -> tuple[bytes, ...]:
-        """A new picture of each camera, as files that `read_photograph` takes; also while another thread does more."""
+        """Take a picture file with each camera, for `read_photograph`; also while another thread uses the robot."""
         ...

@@ -1,4 +1,4 @@
-"""A robot under ROS 2, through rosbridge, without ROS here: compressed images, camera_info, tf in, twists out."""
+"""A robot under ROS 2 through rosbridge, without ROS here: compressed images, camera_info and tf in, twists out."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import binascii
 import json
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -59,47 +60,47 @@ class _Message(Entry):
 
 
 class TransformTree:
-    """`T_parent_child` of each frame; later messages replace what earlier ones told.
+    """The frames of ROS by `T_parent_child`; later messages replace earlier ones.
 
     Args:
         messages: of /tf and /tf_static, the older first.
 
     Raises:
-        InvalidInput: if one is no such message.
+        InvalidInput: if a message is malformed.
     """
 
     def __init__(self, messages: Iterable[Mapping[str, Any]]) -> None:
         self._parents: dict[str, tuple[str, Pose]] = {}
         for message in messages:
             for each in decode(_Message, message, "transforms").transforms:
-                at, q = each.transform.translation, each.transform.rotation
+                t, q = each.transform.translation, each.transform.rotation
                 child = _plain(each.child_frame_id)
-                quaternion = np.array([q.w, q.x, q.y, q.z])
-                pose = Pose(np.array([at.x, at.y, at.z]), unit_quaternion(quaternion, f"rotation of frame {child}"))
-                self._parents[child] = _plain(each.header.frame_id), pose
+                quaternion = unit_quaternion(np.array([q.w, q.x, q.y, q.z]), f"rotation of frame {child}")
+                self._parents[child] = _plain(each.header.frame_id), Pose(np.array([t.x, t.y, t.z]), quaternion)
 
     def pose(self, frame: str, within: str) -> Pose:
-        """`T_within_frame`, along the parents that both have.
+        """Return `T_within_frame`, through a common ancestor.
 
         Raises:
-            UnknownName: if nothing leads from one to the other.
+            UnknownName: if there is none.
         """
-        one, other = self._ways(_plain(frame)), self._ways(_plain(within))
-        for ancestor, T_ancestor_frame in one.items():
-            if ancestor in other:
-                return other[ancestor].inverse() @ T_ancestor_frame
+        T_ancestors_within = self._ancestors(_plain(within))
+        for ancestor, T_ancestor_frame in self._ancestors(_plain(frame)).items():
+            if ancestor in T_ancestors_within:
+                return T_ancestors_within[ancestor].inverse() @ T_ancestor_frame
         raise UnknownName(f"frame that leads to {within}", frame, self._parents)
 
-    def _ways(self, frame: str) -> dict[str, Pose]:
-        """`T_ancestor_frame` of a frame's ancestors, itself included, the nearest first."""
-        ways, pose = {frame: Pose.identity()}, Pose.identity()
+    def _ancestors(self, frame: str) -> dict[str, Pose]:
+        """Return `T_ancestor_frame` of a frame's ancestors, itself included, the nearest first."""
+        pose = Pose.identity()
+        ancestors = {frame: pose}
         while frame in self._parents:
             frame, T_parent_child = self._parents[frame]
-            if frame in ways:  # a circle, which tells nothing
+            if frame in ancestors:  # a circle
                 break
             pose = T_parent_child @ pose
-            ways[frame] = pose
-        return ways
+            ancestors[frame] = pose
+        return ancestors
 
 
 def _plain(frame: str) -> str:
@@ -108,29 +109,14 @@ def _plain(frame: str) -> str:
 
 # The part of rosbridge's protocol (v2.0, JSON over a websocket) that a robot needs: subscribe, advertise, publish.
 #
-# roslibpy speaks all of it, but by the reactor of Twisted, of which a process has one that cannot be started twice:
-# a connection that was lost could not be opened anew, nor closed without the threads that it leaves. What is needed
-# of the protocol are four kinds of messages.
-
+# roslibpy speaks all of it, but through the reactor of Twisted, of which a process has one that cannot be started
+# twice: a lost connection could not be opened anew, nor closed without leaving its threads.
 
 _MOST_BYTES = 64_000_000  # of a message: a large picture is some megabytes in base64
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
-    """The last message of a topic.
-
-    Attributes:
-        message: as rosbridge makes JSON of it.
-        count: of messages of this topic so far.
-    """
-
-    message: Mapping[str, Any]
-    count: int
-
-
 class Rosbridge:
-    """One connection, with a thread that takes what comes.
+    """One connection, with a thread that receives messages.
 
     Args:
         url: of rosbridge's websocket, ws://host:port.
@@ -143,7 +129,7 @@ class Rosbridge:
     def __init__(self, url: str, timeout_s: float) -> None:
         self._url = url
         try:
-            # A robot is beside the computer: no proxy. Pings tell in time that it has gone.
+            # A robot is beside the computer: no proxy. Pings notice in time that it has gone.
             self._socket = connect(
                 url, proxy=None, compression=None, max_size=_MOST_BYTES, open_timeout=timeout_s,
                 close_timeout=timeout_s, ping_interval=timeout_s, ping_timeout=timeout_s,
@@ -151,8 +137,8 @@ class Rosbridge:
         except (OSError, TimeoutError, WebSocketException, InvalidURI) as error:
             raise ConnectionLost(url, str(error) or type(error).__name__) from error
         self._news = threading.Condition()
-        self._received: dict[str, list[Received]] = {}
-        self._kept: dict[str, int] = {}
+        self._messages: dict[str, deque[Mapping[str, Any]]] = {}
+        self._counts: Counter[str] = Counter()
         self._lost = ""
         self._reader = threading.Thread(target=self._read, name="rosbridge", daemon=True)
         self._reader.start()
@@ -166,28 +152,31 @@ class Rosbridge:
             every_ms: least time between two messages [ms].
             kept: how many of the last messages are kept.
         """
-        self._kept[topic] = kept
+        self._messages[topic] = deque(maxlen=kept)
         # A queue of one holds the newest of what comes between two messages; without one (0) nothing is held.
         queue = 0 if kept > 1 else 1
-        self._send(op="subscribe", topic=topic, type=kind, throttle_rate=every_ms, queue_length=queue)
+        self.send(op="subscribe", topic=topic, type=kind, throttle_rate=every_ms, queue_length=queue)
 
-    def advertise(self, topic: str, kind: str) -> None:
-        """Tell that messages of a topic will come."""
-        self._send(op="advertise", topic=topic, type=kind)
+    def send(self, **message: object) -> None:
+        """Send a message of the protocol; from any thread.
 
-    def publish(self, topic: str, message: Mapping[str, Any]) -> None:
-        """Send a message; from any thread."""
-        self._send(op="publish", topic=topic, msg=message)
+        Raises:
+            ConnectionLost: if the connection broke.
+        """
+        try:
+            self._socket.send(json.dumps(message))
+        except (ConnectionClosed, OSError) as error:
+            raise ConnectionLost(self._url, str(error) or type(error).__name__) from error
 
-    def received(self, topic: str) -> tuple[Received, ...]:
-        """The last messages of a topic, the newest last."""
+    def received(self, topic: str) -> tuple[Mapping[str, Any], ...]:
+        """Return the kept messages of a topic, as rosbridge makes JSON of them, the newest last."""
         with self._news:
-            return tuple(self._received.get(topic, ()))
+            return tuple(self._messages[topic])
 
-    def count(self, topic: str) -> int:
-        """Messages of a topic so far."""
+    def count(self, *topics: str) -> int:
+        """Return how many messages of some topics have come so far."""
         with self._news:
-            return self._counted(topic)
+            return sum(self._counts[topic] for topic in topics)
 
     def wait(self, counts: Mapping[str, int], timeout_s: float) -> str | None:
         """Wait until so many messages have come of each topic.
@@ -197,15 +186,17 @@ class Rosbridge:
             timeout_s: for all of them [s].
 
         Returns:
-            A topic that did not come, or None.
+            A topic of which too few came, or None.
 
         Raises:
             ConnectionLost: if the connection broke.
         """
-        with self._news:
-            self._news.wait_for(lambda: self._lost or not self._missing(counts), timeout_s)
-            self._check()
-            return next(iter(self._missing(counts)), None)
+
+        def missing() -> list[str]:
+            return [topic for topic, count in counts.items() if self._counts[topic] < count]
+
+        self._wait_until(lambda: not missing(), timeout_s)
+        return next(iter(missing()), None)
 
     def wait_for_more(self, topics: Sequence[str], count: int, timeout_s: float) -> None:
         """Wait until more than so many messages have come of some topics together, or the time is over.
@@ -213,64 +204,51 @@ class Rosbridge:
         Raises:
             ConnectionLost: if the connection broke.
         """
-        with self._news:
-            self._news.wait_for(lambda: self._lost or sum(map(self._counted, topics)) > count, max(timeout_s, 0.0))
-            self._check()
+        self._wait_until(lambda: self.count(*topics) > count, max(timeout_s, 0.0))
 
     def close(self) -> None:
         """Close the connection; calling it again does nothing."""
         self._socket.close()
         self._reader.join()
 
-    def _missing(self, counts: Mapping[str, int]) -> list[str]:
-        return [topic for topic, count in counts.items() if self._counted(topic) < count]
-
-    def _counted(self, topic: str) -> int:
-        received = self._received.get(topic)
-        return received[-1].count if received else 0
-
-    def _check(self) -> None:
-        if self._lost:
-            raise ConnectionLost(self._url, self._lost)
-
-    def _send(self, **message: object) -> None:
-        try:
-            self._socket.send(json.dumps(message))
-        except (ConnectionClosed, OSError) as error:
-            raise ConnectionLost(self._url, str(error) or type(error).__name__) from error
+    def _wait_until(self, holds: Callable[[], bool], timeout_s: float) -> None:
+        with self._news:
+            self._news.wait_for(lambda: self._lost or holds(), timeout_s)
+            if self._lost:
+                raise ConnectionLost(self._url, self._lost)
 
     def _read(self) -> None:
+        """Receive messages until the connection ends, then note why."""
+        reason = "it closed the connection"
         try:
             for text in self._socket:
                 self._take(text)
-            self._end("it closed the connection")
         except (ConnectionClosed, OSError) as error:
-            self._end(str(error) or type(error).__name__)
+            reason = str(error) or type(error).__name__
+        with self._news:
+            self._lost = reason
+            self._news.notify_all()
 
     def _take(self, text: str | bytes) -> None:
+        """Keep a published message; others, such as a status, are not needed."""
         try:
             content = json.loads(text)
         except ValueError:
             return
         if not isinstance(content, dict) or content.get("op") != "publish" or not isinstance(content.get("msg"), dict):
-            return  # such as a status, which tells nothing that is needed
+            return
         topic = str(content.get("topic"))
-        with self._news:
-            before = self._received.setdefault(topic, [])
-            before.append(Received(content["msg"], self._counted(topic) + 1))
-            del before[: -self._kept.get(topic, 1)]
-            self._news.notify_all()
-
-    def _end(self, reason: str) -> None:
-        with self._news:
-            self._lost = reason
-            self._news.notify_all()
+        if topic in self._messages:
+            with self._news:
+                self._messages[topic].append(content["msg"])
+                self._counts[topic] += 1
+                self._news.notify_all()
 
 
 _TWIST_EVERY_S = 0.05  # more often than any controller gives up on its commands
 _PICTURES_EVERY_MS = 50
-_FRESH = 2  # pictures from when they are asked for: the first may have been exposed before
-_TRANSFORMS_KEPT = 200
+_FRESH = 2  # pictures to wait for: the first may have been exposed before it was asked for
+_TRANSFORMS, _TRANSFORMS_KEPT = ("/tf_static", "/tf"), 200
 _HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # ROS has pixel centres at whole numbers
 
 
@@ -281,7 +259,7 @@ class RosNames:
     Attributes:
         cameras: namespaces of the cameras.
         image: topic of the pictures below each, sensor_msgs/CompressedImage.
-        info: of the calibration, sensor_msgs/CameraInfo.
+        info: topic of the calibration below each, sensor_msgs/CameraInfo.
         twist: topic of the commands, geometry_msgs/TwistStamped in the frame of the table.
         table: frame at the table's centre, z up.
         pusher: frame at the pusher's centre.
@@ -301,12 +279,11 @@ class RosNames:
             InvalidInput: if there is none.
         """
         if not self.cameras or not all(self.cameras):
-            raise InvalidInput(
-                "cameras of the robot", ", ".join(self.cameras) or "missing", "names of ROS, one or more"
-            )
+            given = ", ".join(self.cameras) or "missing"
+            raise InvalidInput("cameras of the robot", given, "names of ROS, one or more")
 
     def topic(self, camera: str, below: str) -> str:
-        """The full name of a camera's topic."""
+        """Return the full name of a camera's topic."""
         return f"/{camera.strip('/')}/{below}"
 
 
@@ -323,19 +300,19 @@ class _Picture(Entry):
 
 
 class RosRobot:
-    """One robot; a `Robot`. `description` has cameras as ROS tells them, and the limits that were given.
+    """A `Robot` under ROS; `description` has the cameras that ROS publishes, and the limits that were given.
 
     Args:
         url: of rosbridge's websocket, ws://host:9090.
         topics: and frames.
-        names: of the objects on the table, which a person tells.
-        limits: that hold for this robot, which ROS has no message for.
+        names: of the objects on the table, given by a person.
+        limits: of this robot, for which ROS has no message.
         timeout_s: how long pictures and calibration may take [s].
 
     Raises:
         ConnectionLost: if nobody answers.
-        RobotRefused: if something that is needed is not published.
-        InvalidInput, UnknownName: if calibration or transforms are not as they must be.
+        RobotRefused: if a topic that is needed is not published.
+        InvalidInput, UnknownName: if calibration or transforms are malformed.
     """
 
     def __init__(
@@ -347,8 +324,8 @@ class RosRobot:
         self._sending = threading.Lock()
         self._bridge = Rosbridge(url, timeout_s)
         try:
-            self._ask()
-            self._cameras = self._described()
+            self._subscribe()
+            self._cameras = self._described_cameras()
             cameras = tuple(camera.kept() for camera in self._cameras)
         except OsfError:
             self._bridge.close()
@@ -357,32 +334,32 @@ class RosRobot:
         self._began = time.monotonic()
 
     def reset(self, seed: int) -> Observation:
-        """Only look: what lies on the table is a person's business."""
+        """Observe: a person arranges the table."""
         return self.observe()
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """A picture of every camera, taken after this was asked; never masks.
+        """Take a new picture with every camera; never masks.
 
         Raises:
             ConnectionLost: if the connection broke.
             RobotRefused: if pictures or transforms do not come.
-            CorruptFile, InvalidInput: if they are not what they should be.
+            CorruptFile, InvalidInput: if they are malformed.
         """
         pictures = self.pictures()
         pusher = self._tree().pose(self._topics.pusher, self._topics.table).position
         return observation_of(self._cameras, pictures, self._names, pusher, time.monotonic() - self._began)
 
     def pictures(self) -> tuple[bytes, ...]:
-        """A picture of every camera, taken after this was asked.
+        """Take a new picture with every camera.
 
         Raises:
             ConnectionLost: if the connection broke.
             RobotRefused: if pictures do not come.
-            CorruptFile: if they are not what they should be.
+            CorruptFile: if they are malformed.
         """
         topics = [self._topics.topic(camera.name, self._topics.image) for camera in self._cameras]
         self._wait({topic: self._bridge.count(topic) + _FRESH for topic in topics})
-        return tuple(_picture(self._bridge.received(topic)[-1].message, topic) for topic in topics)
+        return tuple(_picture(self._bridge.received(topic)[-1], topic) for topic in topics)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
         """Send a velocity again and again for 0.2 s, then zero.
@@ -398,7 +375,7 @@ class RosRobot:
             self._send_unless_halted(velocity)
             self._halted.wait(min(left, _TWIST_EVERY_S))
         self._send_unless_halted(np.zeros(3))
-        self._bridge.wait({}, 0.0)  # a connection that broke is told
+        self._bridge.wait({}, 0.0)  # raises if the connection broke
 
     def start(self) -> None:
         """Let velocities be sent."""
@@ -414,25 +391,24 @@ class RosRobot:
         """Close the connection."""
         self._bridge.close()
 
-    def _ask(self) -> None:
+    def _subscribe(self) -> None:
         bridge, topics = self._bridge, self._topics
         for camera in topics.cameras:
             bridge.subscribe(topics.topic(camera, topics.info), "sensor_msgs/msg/CameraInfo", every_ms=1000)
             image = topics.topic(camera, topics.image)
             bridge.subscribe(image, "sensor_msgs/msg/CompressedImage", every_ms=_PICTURES_EVERY_MS)
-        for topic in ("/tf_static", "/tf"):
+        for topic in _TRANSFORMS:
             bridge.subscribe(topic, "tf2_msgs/msg/TFMessage", kept=_TRANSFORMS_KEPT)
-        bridge.advertise(topics.twist, "geometry_msgs/msg/TwistStamped")
+        bridge.send(op="advertise", topic=topics.twist, type="geometry_msgs/msg/TwistStamped")
 
-    def _described(self) -> tuple[SentCamera, ...]:
+    def _described_cameras(self) -> tuple[SentCamera, ...]:
         topics = {camera: self._topics.topic(camera, self._topics.info) for camera in self._topics.cameras}
         self._wait(dict.fromkeys(topics.values(), 1))
         infos = {
-            camera: decode(_CameraInfo, self._bridge.received(topic)[-1].message, f"camera_info of {camera}")
+            camera: decode(_CameraInfo, self._bridge.received(topic)[-1], f"camera_info of {camera}")
             for camera, topic in topics.items()
         }
-        frames = [*(info.header.frame_id for info in infos.values()), self._topics.pusher]
-        tree = self._complete_tree(frames)
+        tree = self._complete_tree([*(info.header.frame_id for info in infos.values()), self._topics.pusher])
         return tuple(
             SentCamera(
                 camera, tree.pose(info.header.frame_id, self._topics.table), np.reshape(info.k, (3, 3)) + _HALF_PIXEL,
@@ -442,10 +418,10 @@ class RosRobot:
         )  # fmt: skip
 
     def _complete_tree(self, frames: list[str]) -> TransformTree:
-        """Transforms, once they lead from the table to all frames; else the error of the first that they do not."""
+        """Wait for transforms that lead from the table to all frames; raise the error of the first frame without."""
         end = time.monotonic() + self._timeout_s
         while True:
-            count = self._bridge.count("/tf") + self._bridge.count("/tf_static")
+            count = self._bridge.count(*_TRANSFORMS)
             tree = self._tree()
             try:
                 for frame in frames:
@@ -454,11 +430,10 @@ class RosRobot:
             except OsfError:
                 if time.monotonic() > end:
                     raise
-            self._bridge.wait_for_more(("/tf", "/tf_static"), count, end - time.monotonic())
+            self._bridge.wait_for_more(_TRANSFORMS, count, end - time.monotonic())
 
     def _tree(self) -> TransformTree:
-        received = chain(self._bridge.received("/tf_static"), self._bridge.received("/tf"))
-        return TransformTree(one.message for one in received)
+        return TransformTree(chain.from_iterable(map(self._bridge.received, _TRANSFORMS)))
 
     def _wait(self, counts: Mapping[str, int]) -> None:
         missing = self._bridge.wait(counts, self._timeout_s)
@@ -476,7 +451,8 @@ class RosRobot:
         still = {"x": 0.0, "y": 0.0, "z": 0.0}
         twist = {"linear": {"x": x, "y": y, "z": z}, "angular": still}
         # Without a stamp rosbridge takes the time of the robot's clock.
-        self._bridge.publish(self._topics.twist, {"header": {"frame_id": self._topics.table}, "twist": twist})
+        stamped = {"header": {"frame_id": self._topics.table}, "twist": twist}
+        self._bridge.send(op="publish", topic=self._topics.twist, msg=stamped)
 
 
 def _picture(message: Mapping[str, object], topic: str) -> bytes:

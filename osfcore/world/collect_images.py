@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import CannotWrite, InvalidInput, MissingAssets, check_seed
+from osfcore.errors import CannotWrite, InvalidInput, check_ranges, check_seed
 from osfcore.geometry.cameras import (
     DEFAULT_IMAGE_SIDE,
     FIELD_OF_VIEW_DEG,
@@ -32,8 +32,8 @@ from osfcore.io.scene_file import Scene, scene_to_json
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.progress import Progress
 from osfcore.random_streams import Stream, stream_rng
-from osfcore.world.imaging import Picture, RayTracer, TracedMesh
-from osfcore.world.scenes import SceneRequest
+from osfcore.world.imaging import RayTracer, TracedMesh
+from osfcore.world.scenes import SceneRequest, check_object
 from osfcore.world.tabletop import Tabletop
 
 # Image sets for training fields: one object alone, or the bare table, under many lights, in the OSF format.
@@ -42,13 +42,16 @@ from osfcore.world.tabletop import Tabletop
 # x 3, `light_pos` 3-vector in the world, `resolution`), with 8-bit RGBA PNGs beside it. The world of an object set
 # is the object's frame. Every image has its own view and its own light, drawn independently for train and test.
 
-
 FRAME_FILL = 0.87  # share of the image's side that the bounding sphere spans
 TEST_IMAGES = 40
 MIN_IMAGES = 60
 MAX_IMAGES = 5000
 _SAMPLES = 4
+TRUTH_FILE = "truth.json"
 Split = Literal["train", "test"]
+# Makes an image from a random generator, its number in the split and the size of the split. Returns the camera, the
+# light's position, and RGBA (h, w, 4).
+Shoot = Callable[[np.random.Generator, int, int], tuple[Camera, np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +97,7 @@ def collect_object(config: CollectObject, library: AssetLibrary) -> Iterator[Pro
         UnknownName, MissingAssets: if the object is not in the library.
         InvalidInput: if a number is out of range or the folder is not empty.
     """
-    if not library.has(config.name):
-        library.info(config.name)
-        raise MissingAssets([config.name])
+    check_object(library, config.name)
     mesh = TracedMesh(library.load(config.name).mesh)
     tracer = RayTracer({config.name: mesh})
     # The cone that touches the sphere has half-angle asin(radius / distance).
@@ -104,19 +105,14 @@ def collect_object(config: CollectObject, library: AssetLibrary) -> Iterator[Pro
     distance = mesh.radius_m / np.sin(half_angle)
 
     def shoot(rng: np.random.Generator, number: int, count: int) -> tuple[Camera, np.ndarray, np.ndarray]:
-        """Camera and unit vector toward the light, both in the object's frame, and RGBA image.
-
-        Args:
-            rng: draws them.
-            number: of the image in its split, which tells the ring of views.
-            count: images of the split.
-        """
         camera = Camera.look_at("view", distance * _spread(rng, number, count), (0, 0, 0), size=config.size)
-        light = _spread(rng, int(rng.integers(count)), count)
+        light = _spread(rng, int(rng.integers(count)), count)  # the unit vector toward it
         picture = tracer.render_alone(config.name, light, camera, samples=_SAMPLES)
-        return camera, light, _straight_alpha(picture)
+        alpha = picture.coverage[0]
+        own_colour = picture.rgb / np.maximum(alpha, 1e-6)[..., None]  # straight alpha
+        return camera, light, np.concatenate([own_colour, alpha[..., None]], axis=-1)
 
-    yield from _write_set(config.out, config.images, config.size, config.seed, shoot, config.name)
+    yield from _write_set(config, shoot, config.name)
 
 
 def collect_table(config: CollectTable) -> Iterator[Progress]:
@@ -132,39 +128,30 @@ def collect_table(config: CollectTable) -> Iterator[Progress]:
     nothing = Pose(np.zeros((0, 3)), np.zeros((0, 4)))
 
     def shoot(rng: np.random.Generator, number: int, count: int) -> tuple[Camera, np.ndarray, np.ndarray]:
-        """Camera, position of the light in the world and RGBA image.
-
-        Args:
-            rng: draws them.
-            number: of the image in its split: odd ones are taken from anywhere.
-            count: images of the split; it does not matter here.
-        """
         light = Light.random(rng, MIN_LIGHT_ELEVATION_DEG)
         camera = fixed[(number // 2) % len(fixed)] if number % 2 == 0 else _anywhere(rng, config.size)
         (picture,) = tracer.render(SceneState((), nothing, light, None), (camera,), samples=_SAMPLES)
         opaque = np.ones((config.size, config.size, 1), np.float32)
         return camera, light.position, np.concatenate([picture.rgb, opaque], axis=-1)
 
-    yield from _write_set(config.out, config.images, config.size, config.seed, shoot, "table")
+    yield from _write_set(config, shoot, "table")
 
 
-def _write_set(out: Path, images: int, size: int, seed: int, shoot, what: str) -> Iterator[Progress]:  # noqa: ANN001
+def _write_set(config: CollectObject | CollectTable, shoot: Shoot, what: str) -> Iterator[Progress]:
     """Write both splits into a folder, which takes its name only when everything is there."""
-    image_side(size)
-    if not MIN_IMAGES <= images <= MAX_IMAGES:
-        raise InvalidInput("number of images", images, f"between {MIN_IMAGES} and {MAX_IMAGES}")
-    if seed < 0:
-        raise InvalidInput("seed", seed, "0 or more")
-    out = out.absolute()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InvalidInput("output folder", out, "new or empty")
+    image_side(config.size)
+    images = config.images
+    check_ranges(("number of images", images, MIN_IMAGES, MAX_IMAGES))
+    if config.seed < 0:
+        raise InvalidInput("seed", config.seed, "0 or more")
+    out = _check_folder(config.out)
     test = max(TEST_IMAGES, images // 8)
     counts: dict[Split, int] = {"train": images - test, "test": test}
     done = 0
     try:
         with folder_at_once(out) as partial:
             for part, (split, count) in enumerate(counts.items()):
-                rng = stream_rng(seed, Stream.COLLECTED_IMAGES, part)
+                rng = stream_rng(config.seed, Stream.COLLECTED_IMAGES, part)
                 folder = partial / split
                 folder.mkdir(parents=True)
                 annotations = []
@@ -178,10 +165,17 @@ def _write_set(out: Path, images: int, size: int, seed: int, shoot, what: str) -
         raise CannotWrite(out, error.strerror or str(error)) from error
 
 
+def _check_folder(out: Path) -> Path:
+    """Return the absolute path of an output folder that is new or empty; refuse any other."""
+    out = out.absolute()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InvalidInput("output folder", out, "new or empty")
+    return out
+
+
 def _save(path: Path, camera: Camera, light: np.ndarray, rgba: Float[np.ndarray, "h w 4"]) -> dict[str, object]:
     """Write one image; return its entry in anno.json."""
-    pixels = to_uint8(rgba)
-    if not cv2.imwrite(str(path), cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA)):
+    if not cv2.imwrite(str(path), cv2.cvtColor(to_uint8(rgba), cv2.COLOR_RGBA2BGRA)):
         raise OSError(f"{path.name} could not be written")
     return {
         "filename": path.name,
@@ -192,34 +186,26 @@ def _save(path: Path, camera: Camera, light: np.ndarray, rgba: Float[np.ndarray,
     }
 
 
-def _straight_alpha(picture: Picture) -> Float[np.ndarray, "h w 4"]:
-    """The object's own colour with its coverage as opacity."""
-    alpha = picture.coverage[0]
-    return np.concatenate([picture.rgb / np.maximum(alpha, 1e-6)[..., None], alpha[..., None]], axis=-1)
-
-
 def _spread(rng: np.random.Generator, number: int, count: int) -> Float[np.ndarray, "3"]:
-    """One of `count` unit vectors that cover the sphere evenly: a random point of the number-th of equal-area rings."""
-    z = 1 - 2 * (number + rng.uniform()) / count
+    """Draw one of `count` unit vectors that cover the sphere evenly: a point of the number-th of equal-area rings."""
+    return _at_height(rng, 1 - 2 * (number + rng.uniform()) / count)
+
+
+def _at_height(rng: np.random.Generator, z: float) -> Float[np.ndarray, "3"]:
+    """Draw a unit vector with a given z."""
     angle = rng.uniform(-np.pi, np.pi)
     radius = np.sqrt(max(1 - z * z, 0))
     return np.array([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
 def _anywhere(rng: np.random.Generator, size: int) -> Camera:
-    """A camera 0.5 to 1.1 m from the table's centre, at least 15 deg above the table, looking near its centre."""
-    z = rng.uniform(np.sin(np.deg2rad(15)), 1)
-    angle = rng.uniform(-np.pi, np.pi)
-    radius = np.sqrt(1 - z * z)
-    direction = np.array([radius * np.cos(angle), radius * np.sin(angle), z])
+    """Draw a camera 0.5 to 1.1 m from the table's centre, 15 deg or more above the table, looking near its centre."""
+    direction = _at_height(rng, rng.uniform(np.sin(np.deg2rad(15)), 1))
     target = (*rng.uniform(-0.1, 0.1, 2), SCENE_CENTRE[2])
     return Camera.look_at("view", rng.uniform(0.5, 1.1) * direction, target, size=size)
 
 
-# One observation of a random scene, as anybody's cameras might have taken it, with the truth beside it.
-
-
-TRUTH_FILE = "truth.json"
+# One observation of a random scene, with the truth beside it.
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,9 +247,7 @@ def collect_observation(
     """
     image_side(config.size)
     check_seed(config.seed)
-    out = config.out.absolute()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InvalidInput("output folder", out, "new or empty")
+    out = _check_folder(config.out)
     cameras = (goal_camera(config.size),) if config.goal else default_cameras(config.size)
     world = Tabletop(library, cameras=cameras, request=SceneRequest(_names(config, library, known), config.objects))
     try:
@@ -274,26 +258,19 @@ def collect_observation(
         world.close()
     if config.goal:
         del truth["pusher"]
-    _write(out, observation, truth)
+    with folder_at_once(out) as partial:
+        write_json(partial / TRUTH_FILE, truth)
+        write_observation(partial, observation)
     return observation
 
 
 def _names(config: CollectObservation, library: AssetLibrary, known: Collection[str] | None) -> tuple[str, ...] | None:
-    """The objects; None leaves the choice, or the complaint that there are none, to the world."""
+    """Choose the objects; None leaves the choice, or the error that there are none, to the world."""
     if config.names is not None or known is None:
         return config.names
     choice = [name for name in library.names() if name in known]
     if not choice:
         return None
-    most = min(len(choice), MAX_OBJECTS)
-    if not 1 <= config.objects <= most:
-        raise InvalidInput("number of objects", config.objects, f"between 1 and {most}")
+    check_ranges(("number of objects", config.objects, 1, min(len(choice), MAX_OBJECTS)))
     rng = stream_rng(config.seed, Stream.COLLECTED_NAMES)
     return tuple(choice[i] for i in rng.choice(len(choice), config.objects, replace=False))
-
-
-def _write(out: Path, observation: Observation, truth: dict[str, object]) -> None:
-    """Truth and observation, all or nothing."""
-    with folder_at_once(out) as partial:
-        write_json(partial / TRUTH_FILE, truth)
-        write_observation(partial, observation)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, SUBSTEPS, is_on_table, pusher_path, substates
-from osfcore.errors import CannotWrite, InvalidInput, WorkerDied
+from osfcore.errors import CannotWrite, InvalidInput, WorkerDied, check_ranges
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera, image_side
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import (
@@ -35,29 +35,27 @@ from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng, stream_seed
 from osfcore.world.physics import TIME_STEP_S, BodyModel, Physics
-from osfcore.world.scenes import SceneRequest
+from osfcore.world.scenes import SceneRequest, check_request
 from osfcore.world.tabletop import Renderer, Tabletop
 
-# What would have happened had things been a little elsewhere and moved a little otherwise.
+# Substeps from disturbed states.
 #
-# Recorded motion shows only states that physics leads to. A network that predicts many steps in a row leads itself
-# to others: an object too fast, turning too slowly, a hair off the pusher. From recorded states, disturbed in that
-# way, the simulator tells what the next substep would do, so that a network learns to fall back rather than to err
-# on.
-
+# Recorded motion holds only states that physics reaches. A network that predicts many steps in a row reaches others:
+# an object too fast, turning too slowly, a little off the pusher. The simulator plays the next substep from recorded
+# states that are disturbed in that way, so that a network learns to return to physical states.
 
 _SUBSTEP_S = STEP_S / SUBSTEPS
 _TICKS = round(_SUBSTEP_S / TIME_STEP_S)
-_MOST = 0.5  # of its own size, and of the following, by which a velocity is disturbed at most (one sigma)
+_MOST = 0.5  # largest sigma of a disturbed velocity, as a share of its size and the following together
 _SPEED_M, _SPEED_RAD = 0.002, 0.04  # in a substep
-_ALONG = np.array([1, 1, 0.3])  # less upward, for things stay on the table
-_ABOUT = np.array([0.5, 0.5, 1])
-_OFF_M, _OFF_RAD = 5e-4, 0.01  # sigma of a disturbed pose, at most
-_OFF_SHARE = 0.6  # of the objects whose pose is disturbed as well
+_ALONG = np.array([1, 1, 0.3])  # factors on x, y, z: less upward, for objects stay on the table
+_ABOUT = np.array([0.5, 0.5, 1])  # factors on the angular velocity
+_OFF_M, _OFF_RAD = 5e-4, 0.01  # largest sigma of a disturbed pose
+_OFF_SHARE = 0.6  # of the objects, whose pose is disturbed as well
 
 
 def disturbed(episode: PushEpisode, models: Mapping[str, BodyModel], rng: np.random.Generator, count: int) -> Disturbed:
-    """Substeps from disturbed states of an episode, `count` for each substep in which something moves.
+    """Simulate substeps from disturbed states of an episode, `count` for each substep in which something moves.
 
     Args:
         episode: recorded with poses within its actions.
@@ -85,10 +83,8 @@ class _Track:
     """An episode substep by substep.
 
     Attributes:
-        busy: substeps before which and in which something moves, everything on the table.
+        busy: substeps in which and before which something moves, with everything on the table.
     """
-
-    busy: Int[np.ndarray, "S"]
 
     def __init__(self, episode: PushEpisode, models: Mapping[str, BodyModel]) -> None:
         self._episode = episode
@@ -100,17 +96,15 @@ class _Track:
         turned = quaternion_multiply(self._quaternions[1:], quaternion_conjugate(self._quaternions[:-1]))
         self._angular = quaternion_log(turned)
         self._path = pusher_path(episode.pusher[0, :2], episode.actions[:, :2])
-        safe = is_on_table(episode)
-        is_safe = np.repeat(safe[:-1] & safe[1:], SUBSTEPS)
-        moves: Bool[np.ndarray, "S"] = np.any(self._awake(self._linear, self._angular), axis=1)
-        self.busy = 1 + np.flatnonzero(moves[1:] & moves[:-1] & is_safe[1:])
-
-    @staticmethod
-    def _awake(linear: np.ndarray, angular: np.ndarray) -> np.ndarray:
-        return (np.linalg.norm(linear, axis=-1) > SLEEP_M) | (np.linalg.norm(angular, axis=-1) > SLEEP_RAD)
+        is_shifting = np.linalg.norm(self._linear, axis=-1) > SLEEP_M
+        self._awake = is_shifting | (np.linalg.norm(self._angular, axis=-1) > SLEEP_RAD)
+        on_table = is_on_table(episode)
+        is_safe = np.repeat(on_table[:-1] & on_table[1:], SUBSTEPS)
+        moves: Bool[np.ndarray, "S"] = np.any(self._awake, axis=1)
+        self.busy: Int[np.ndarray, "S"] = 1 + np.flatnonzero(moves[1:] & moves[:-1] & is_safe[1:])
 
     def disturb(self, physics: Physics, step: int, rng: np.random.Generator) -> tuple[object, ...]:
-        """One substep from a disturbed state: the row of a `Disturbed`.
+        """Simulate one substep from a disturbed state; return the row of a `Disturbed`.
 
         Args:
             physics: a simulation of the episode's objects.
@@ -118,7 +112,7 @@ class _Track:
             rng: draws the disturbance.
         """
         linear, angular = self._linear[step - 1], self._angular[step - 1]
-        awake = self._awake(linear, angular)[:, None]
+        awake = self._awake[step - 1][:, None]
         share = _MOST * rng.random((len(awake), 1))
         linear = awake * (linear + _noise(linear, share, _SPEED_M, rng) * _ALONG)
         angular = awake * (angular + _noise(angular, share, _SPEED_RAD, rng) * _ABOUT)
@@ -135,7 +129,7 @@ class _Track:
     def _play(
         self, physics: Physics, step: int, start: Pose, linear: Float[np.ndarray, "N 3"], angular: np.ndarray
     ) -> Pose:
-        """Where everything is one substep later."""
+        """Return all poses one substep after a start with given velocities [m and rad in a substep]."""
         names = self._episode.names
         for i, name in enumerate(names):
             physics.place(name, Pose(start.position[i], start.quaternion[i]))
@@ -143,17 +137,17 @@ class _Track:
         physics.place_pusher(np.array([*self._path[step], PUSHER_CENTRE_Z_M]))
         for _ in range(_TICKS):
             physics.step(self._episode.actions[step // SUBSTEPS])
-        poses = [physics.pose(name) for name in names]
-        return Pose.stacked(poses)
+        return Pose.stacked(physics.pose(name) for name in names)
 
 
 def _noise(
     velocity: Float[np.ndarray, "N 3"], share: Float[np.ndarray, "N 1"], base: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "N 3"]:
+    """Draw noise whose sigma is a share of the velocity's size plus a base."""
     return share * (np.linalg.norm(velocity, axis=1, keepdims=True) + base) * rng.normal(size=velocity.shape)
 
 
-# How the pusher moves while data are collected: the paper's random walk, and one that seeks contact.
+# Policies of the pusher while data are collected: the paper's random walk, and one that seeks contact.
 
 
 PolicyName = Literal["paper", "directed"]
@@ -171,7 +165,7 @@ class PaperPolicy:
         self._rng = rng
 
     def action(self, state: SceneState) -> Float[np.ndarray, "3"]:
-        """The next velocity (vx, vy, 0) [m/s]; the state plays no part."""
+        """Draw the next velocity (vx, vy, 0) [m/s]; the state is not used."""
         return np.array([*self._rng.uniform(-MAX_SPEED_M_S, MAX_SPEED_M_S, 2), 0.0])
 
 
@@ -195,9 +189,13 @@ class DirectedPolicy:
         self._speed = MAX_SPEED_M_S
 
     def action(self, state: SceneState) -> Float[np.ndarray, "3"]:
-        """The next velocity (vx, vy, 0) [m/s], each component at most 0.3 m/s."""
+        """Choose the next velocity (vx, vy, 0) [m/s], each component at most 0.3 m/s.
+
+        Raises:
+            InvalidInput: if the state has no pusher.
+        """
         if state.pusher is None:
-            raise ValueError("a pushing policy needs a pusher")
+            raise InvalidInput("pusher of the state", "missing", "there")
         pusher = state.pusher[:2]
         if self._push_steps == 0 and self._travel_steps == 0:
             self._choose(state)
@@ -218,7 +216,7 @@ class DirectedPolicy:
         return _limited(self._speed * aim + self._rng.normal(0, _NOISE_M_S, 2))
 
     def _choose(self, state: SceneState) -> None:
-        """A random object and a way toward a random place in the workspace."""
+        """Choose a random object and a direction toward a random place in the workspace."""
         self._target = state.names[self._rng.integers(len(state.names))]
         place = self._rng.uniform(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, 2)
         way = place - state.pose(self._target).position[:2]
@@ -228,7 +226,10 @@ class DirectedPolicy:
         self._travel_steps = _TRAVEL_STEPS
 
     def _way_behind(self, pusher: np.ndarray, pose: Pose) -> tuple[Float[np.ndarray, "2"], bool]:
-        """The next stretch [m] on the way behind the object, around it if need be, and whether it is reached."""
+        """Return the next displacement [m] on the way behind the object, around it if need be; and whether it is there.
+
+        A pusher that is not yet behind the object follows a circle around it.
+        """
         outline = rotate(pose.quaternion, self._parts[self._target])[:, :2]
         centre = pose.position[:2]
         standoff = float((outline @ -self._direction).max()) + PUSHER_RADIUS_M + _CLEARANCE_M
@@ -238,7 +239,7 @@ class DirectedPolicy:
             return way, True
         out = pusher - centre
         distance = max(float(np.linalg.norm(out)), 1e-6)
-        if out @ -self._direction < 0.5 * distance:  # not yet behind it: follow a circle around it
+        if out @ -self._direction < 0.5 * distance:
             radius = np.linalg.norm(outline, axis=1).max() + PUSHER_RADIUS_M + _CLEARANCE_M
             tangent = np.array([-out[1], out[0]]) / distance
             tangent *= np.sign(tangent @ (behind - centre)) or 1.0
@@ -247,7 +248,7 @@ class DirectedPolicy:
 
 
 def _limited(velocity: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
-    """Scaled into the speed limit without changing direction."""
+    """Scale a velocity [m/s] into the speed limit without changing its direction."""
     velocity = velocity / max(np.abs(velocity).max() / MAX_SPEED_M_S, 1.0)
     return np.array([*np.clip(velocity, -MAX_SPEED_M_S, MAX_SPEED_M_S), 0.0])
 
@@ -264,7 +265,7 @@ _MAX_EPISODES, _MAX_STEPS, _MAX_DISTURB = 1_000_000, 1000, 100
 
 @dataclass(frozen=True, slots=True)
 class CollectPushes:
-    """What to collect.
+    """Settings of a collection.
 
     Attributes:
         out: the HDF5 file to write; must not exist.
@@ -274,10 +275,9 @@ class CollectPushes:
         policy: "paper" (uniform random velocities) or "directed" (seeks sustained contact).
         seed: of everything.
         images: whether to keep frames of one camera as well, with the pusher.
-        renderer: what takes the frames.
+        renderer: of the frames.
         names: objects to choose from; all of the library if None.
-        disturb: from how many disturbed states to simulate each substep in which something moves (see
-            `osfcore.world.collect_pushes`).
+        disturb: from how many disturbed states to simulate each substep in which something moves.
         camera: that takes the frames.
         size: side of the frames [px].
         random_lights: frames under one light per episode from the whole hemisphere down to the lowest light that is
@@ -323,7 +323,7 @@ class CollectStep:
 def collect_pushes(
     config: CollectPushes, library: AssetLibrary, executor: Executor | None = None, in_flight: int = 8
 ) -> Iterator[CollectStep]:
-    """Collect episodes; what was finished before a kill is kept and neither lost nor repeated.
+    """Collect episodes; those that were finished before a kill are neither lost nor repeated.
 
     The content depends on the settings, not on the executor. An abandoned generator leaves its finished episodes in
     `OUT.partial`, from which the next run goes on.
@@ -340,58 +340,40 @@ def collect_pushes(
         OsfError: if there are too few objects.
     """
     _check(config)
-    Tabletop(
-        library, request=SceneRequest(count=config.objects, among=config.names)
-    ).close()  # refuses before anything is written
-    settings = {
-        "steps": config.steps,
-        "objects": config.objects,
-        "policy": config.policy,
-        "seed": config.seed,
-        "images": config.images,
-        "renderer": config.renderer,
-        "available": list(library.names() if config.names is None else config.names),
-        "disturb": config.disturb,
-    }
+    check_request(library, SceneRequest(count=config.objects, among=config.names))
+    decisive = ("steps", "objects", "policy", "seed", "images", "renderer", "disturb")
     if config.images:
-        settings |= {"camera": config.camera, "size": config.size, "random_lights": config.random_lights}
+        decisive += ("camera", "size", "random_lights")
+    settings = {name: getattr(config, name) for name in decisive}
+    settings["available"] = list(library.names() if config.names is None else config.names)
     try:
         config.out.parent.mkdir(parents=True, exist_ok=True)
         with EpisodeFolder(config.out, settings) as folder:
-            yield from _collect(config, library.root, folder, executor, in_flight)
+            tally, done = _Tally(config), folder.finished()
+            for index in sorted(i for i in done if i < config.episodes):
+                tally.add(load_episode(folder.path(index)))
+            yield tally.step()
+            missing = (i for i in range(config.episodes) if i not in done)
+            for index, episode in _simulate(config, library.root, missing, executor, in_flight):
+                save_episode(folder.path(index), episode)
+                tally.add(episode, is_new=True)
+                yield tally.step()
+            folder.combine(config.episodes)
     except BrokenProcessPool as error:
         raise WorkerDied("collecting pushes") from error
     except OSError as error:
         raise CannotWrite(config.out, error.strerror or str(error)) from error
 
 
-def _collect(
-    config: CollectPushes, root: Path, folder: EpisodeFolder, executor: Executor | None, in_flight: int
-) -> Iterator[CollectStep]:
-    """Count what is there, run what is missing, put everything into one file."""
-    tally = _Tally(config)
-    done = folder.finished()
-    for index in sorted(i for i in done if i < config.episodes):
-        tally.add(load_episode(folder.path(index)))
-    yield tally.step()
-    missing = (i for i in range(config.episodes) if i not in done)
-    for episode in _episodes(config, root, folder, missing, executor, in_flight):
-        tally.add(episode, is_new=True)
-        yield tally.step()
-    folder.combine(config.episodes)
-
-
 def _check(config: CollectPushes) -> None:
-    if not 1 <= config.episodes <= _MAX_EPISODES:
-        raise InvalidInput("number of episodes", config.episodes, f"between 1 and {_MAX_EPISODES}")
-    if not 1 <= config.steps <= _MAX_STEPS:
-        raise InvalidInput("number of steps", config.steps, f"between 1 and {_MAX_STEPS}")
-    if not 1 <= config.objects <= MAX_OBJECTS:
-        raise InvalidInput("number of objects", config.objects, f"between 1 and {MAX_OBJECTS}")
+    check_ranges(
+        ("number of episodes", config.episodes, 1, _MAX_EPISODES),
+        ("number of steps", config.steps, 1, _MAX_STEPS),
+        ("number of objects", config.objects, 1, MAX_OBJECTS),
+        ("disturbed states of each substep", config.disturb, 0, _MAX_DISTURB),
+    )
     if config.policy not in ("paper", "directed"):
         raise InvalidInput("policy", repr(config.policy), '"paper" or "directed"')
-    if not 0 <= config.disturb <= _MAX_DISTURB:
-        raise InvalidInput("disturbed states of each substep", config.disturb, f"between 0 and {_MAX_DISTURB}")
     if config.seed < 0:
         raise InvalidInput("seed", config.seed, "0 or more")
     if config.camera not in ("0", "goal"):
@@ -425,18 +407,12 @@ class _Tally:
         return CollectStep(self._done, self._config.episodes, note, contact, motion, rate)
 
 
-def _episodes(
-    config: CollectPushes,
-    root: Path,
-    folder: EpisodeFolder,
-    missing: Iterator[int],
-    executor: Executor | None,
-    in_flight: int,
-) -> Iterator[PushEpisode]:
-    """Run the missing episodes, here or in the executor, a few at a time."""
+def _simulate(
+    config: CollectPushes, root: Path, missing: Iterator[int], executor: Executor | None, in_flight: int
+) -> Iterator[tuple[int, PushEpisode]]:
+    """Run the missing episodes, here or in the executor (maybe on other machines), a few at a time."""
     if executor is None:
-        for index in missing:
-            yield _kept(folder.path(index), _run_episode(config, root, index))
+        yield from ((index, _run_episode(config, root, index)) for index in missing)
         return
     running: dict[Future[PushEpisode], int] = {}
     try:
@@ -449,7 +425,7 @@ def _episodes(
                 return
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in finished:
-                yield _kept(folder.path(running.pop(future)), future.result())
+                yield running.pop(future), future.result()
     finally:
         for future in running:
             future.cancel()
@@ -459,17 +435,11 @@ def _episodes(
 def _tabletop(
     root: Path, objects: int, names: tuple[str, ...] | None, renderer: Renderer, view: tuple[FrameCamera, int]
 ) -> Tabletop:
-    """One simulator per process and setting: its meshes stay loaded from episode to episode."""
+    """Make one simulator per process and setting: its meshes stay loaded from episode to episode."""
     request = SceneRequest(count=objects, among=names)
     name, size = view
     camera = goal_camera(size) if name == "goal" else default_cameras(size)[0]
     return Tabletop(AssetLibrary(root), cameras=(camera,), request=request, renderer=renderer)
-
-
-def _kept(path: Path, episode: PushEpisode) -> PushEpisode:
-    """Save an episode here: whoever simulated it may be on another machine."""
-    save_episode(path, episode)
-    return episode
 
 
 def _run_episode(config: CollectPushes, root: Path, index: int) -> PushEpisode:
@@ -483,20 +453,21 @@ def _run_episode(config: CollectPushes, root: Path, index: int) -> PushEpisode:
     rng = stream_rng(config.seed, Stream.COLLECTED_POLICY, index)
     policy = PaperPolicy(rng) if config.policy == "paper" else DirectedPolicy(world.assets, rng)
     states, contacts, actions, within = [world.truth()], [], [], []
-    frames = [_frame(world, config)]
+    frames = [to_uint8(world.observe().images)] if config.images else []
     for _ in range(config.steps):
         actions.append(policy.action(states[-1]))
         touched, poses = world.act_recorded(actions[-1], SUBSTATES)
         within.append(poses)
         contacts.append([name in touched for name in world.names])
         states.append(world.truth())
-        frames.append(_frame(world, config))
+        if config.images:
+            frames.append(to_uint8(world.observe().images))
     episode = PushEpisode(
         names=world.names,
         seed=seed,
         positions=np.array([s.poses.position for s in states]),
         quaternions=np.array([s.poses.quaternion for s in states]),
-        pusher=np.array([_pusher(s) for s in states]),
+        pusher=np.array([s.pusher for s in states]),
         actions=np.array(actions),
         contact=np.array(contacts, bool),
         sub_positions=np.array([poses.position for poses in within]),
@@ -505,18 +476,5 @@ def _run_episode(config: CollectPushes, root: Path, index: int) -> PushEpisode:
     )
     if config.disturb:
         disturbance = stream_rng(config.seed, Stream.COLLECTED_DISTURBANCE, index)
-        substeps = disturbed(episode, world.models, disturbance, config.disturb)
-        episode = replace(episode, disturbed=substeps)
+        episode = replace(episode, disturbed=disturbed(episode, world.models, disturbance, config.disturb))
     return episode
-
-
-def _pusher(state: SceneState) -> np.ndarray:
-    assert state.pusher is not None
-    return state.pusher
-
-
-def _frame(world: Tabletop, config: CollectPushes) -> np.ndarray:
-    """The camera's view as one 8-bit frame, or no frame."""
-    if not config.images:
-        return np.zeros((0, config.size, config.size, 3), np.uint8)
-    return to_uint8(world.observe().images)

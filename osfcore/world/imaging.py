@@ -21,13 +21,12 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
 from osfcore.objects.asset import TexturedMesh
 
-# The image model's materials and lamp: what every picture of this project is made of.
+# Materials and lamp of the image model: Lambert shading without specular part,
 #
-# Lambert shading without specular part, as stated in the README's conventions: radiance = albedo * (ambient +
-# diffuse * max(0, n . l) * visible), visible in {0, 1}. Values are linear, no gamma. A near lamp has its place,
-# cone and falloff besides (`SpotLamp`). Lamps of another strength or colour, and other tables, are for measuring
-# what a method does that is not told of them.
-
+#     radiance = albedo * (ambient + diffuse * max(0, n . l) * visible),    visible in {0, 1},
+#
+# in linear values, no gamma. A near lamp has a place, a cone and falloff besides (`SpotLamp`). Lamps of another
+# strength or colour, and other tables, serve to measure methods that do not know of them.
 
 TABLE_ALBEDO = (0.66, 0.62, 0.56)  # pale wood, uniform, so that only light and shadow change it
 BACKGROUND_RADIANCE = (0.10, 0.11, 0.12)  # beyond the table's edge; no lamp reaches it
@@ -54,13 +53,13 @@ class Lamp:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TableSurface:
-    """What the table's top looks like.
+    """The look of the table's top.
 
     Attributes:
-        albedo: of every point, linear; without a meaning where there is a texture.
+        albedo: of every point, linear; not used where there is a texture.
         texture: linear albedo in [0, 1], spread once over the table: its first row lies at the side of greatest y, its
             first column at that of least x. None for a table of one colour.
-        levels: the texture and its halvings down to one texel, each the area average of the one before.
+        levels: mip pyramid of the texture; empty if there is none.
     """
 
     albedo: tuple[float, float, float] = TABLE_ALBEDO
@@ -68,24 +67,21 @@ class TableSurface:
     levels: tuple[Float[np.ndarray, "_ _ 3"], ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the texture and halve it.
+        """Check the texture and build its pyramid.
 
         Raises:
             InvalidInput: if the texture is not linear RGB in [0, 1].
         """
-        levels = []
+        levels = ()
         if self.texture is not None:
-            texture = np.ascontiguousarray(self.texture, np.float32)
+            texture = np.asarray(self.texture, np.float32)
             if texture.ndim != 3 or texture.shape[2] != 3 or not np.all((texture >= 0) & (texture <= 1)):
                 raise InvalidInput("texture of the table", f"of shape {texture.shape}", "rows of RGB in [0, 1]")
-            levels.append(texture)
-            while max(levels[-1].shape[:2]) > 1:
-                half = tuple(max(side // 2, 1) for side in levels[-1].shape[1::-1])
-                levels.append(cv2.resize(levels[-1], half, interpolation=cv2.INTER_AREA))
-        object.__setattr__(self, "levels", tuple(levels))
+            levels = _mip_pyramid(texture)
+        object.__setattr__(self, "levels", levels)
 
     def albedo_at(self, points: Float[np.ndarray, "S 2"], footprint_m: float = 0.0) -> Float[np.ndarray, "S 3"]:
-        """Albedo of points of the table, interpolated between texels.
+        """Interpolate the albedo at points of the table.
 
         Args:
             points: x and y in the world [m].
@@ -93,32 +89,56 @@ class TableSurface:
         """
         if self.texture is None:
             return np.broadcast_to(np.array(self.albedo, np.float32), (len(points), 3))
-        level = float(np.log2(max(footprint_m * max(self.texture.shape[:2]) / TABLE_SIDE_M, 1.0)))
-        level = min(level, len(self.levels) - 1.0)
-        fine = int(level)
-        albedo = _bilinear(self.levels[fine], points)
-        if level > fine:
-            albedo += (level - fine) * (_bilinear(self.levels[fine + 1], points) - albedo)
-        return albedo
+        across, down = points[:, 0] / TABLE_SIDE_M + 0.5, 0.5 - points[:, 1] / TABLE_SIDE_M
+        return _trilinear(self.levels, across, down, footprint_m * max(self.texture.shape[:2]) / TABLE_SIDE_M)
 
 
-def _bilinear(texture: Float[np.ndarray, "rows columns 3"], points: Float[np.ndarray, "S 2"]) -> np.ndarray:
-    """Texels at points of the table [m], clamped at its edge."""
+def _mip_pyramid(texture: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Halve a texture down to 1 texel, each level the area average of the one before; the finest comes first."""
+    levels = [np.ascontiguousarray(texture)]
+    while max(levels[-1].shape[:2]) > 1:
+        height, width = levels[-1].shape[:2]
+        half = (max(width // 2, 1), max(height // 2, 1))
+        levels.append(cv2.resize(levels[-1], half, interpolation=cv2.INTER_AREA))
+    return tuple(levels)
+
+
+def _trilinear(
+    levels: tuple[np.ndarray, ...], across: Float[np.ndarray, "S"], down: Float[np.ndarray, "S"], texels: float
+) -> Float[np.ndarray, "S 3"]:
+    """Look up colours in [0, 1], interpolated between texels and between levels.
+
+    Args:
+        levels: of a mip pyramid, of float32 or of 8 bits.
+        across: places from the left (0) to the right side (1) of the texture.
+        down: places from the top (0) to the bottom (1).
+        texels: side of the square that is averaged, in texels of the finest level.
+    """
+    level = min(float(np.log2(max(texels, 1.0))), len(levels) - 1.0)
+    fine = int(level)
+    colours = _bilinear(levels[fine], across, down)
+    if level > fine:
+        colours += (level - fine) * (_bilinear(levels[fine + 1], across, down) - colours)
+    return colours
+
+
+def _bilinear(texture: np.ndarray, across: Float[np.ndarray, "S"], down: Float[np.ndarray, "S"]) -> np.ndarray:
+    """Interpolate a texture between its texels, clamped at its border."""
     height, width = texture.shape[:2]
-    count = len(points)
-    rows = max(-(-count // _REMAP_COLUMNS), 1)
-    x, y = np.zeros((2, rows * _REMAP_COLUMNS), np.float32)
-    x[:count] = (points[:, 0] / TABLE_SIDE_M + 0.5) * width - 0.5
-    y[:count] = (0.5 - points[:, 1] / TABLE_SIDE_M) * height - 0.5
-    shape = (rows, _REMAP_COLUMNS)
+    count = len(across)
+    shape = (max(-(-count // _REMAP_COLUMNS), 1), _REMAP_COLUMNS)
+    x, y = np.zeros((2, shape[0] * shape[1]), np.float32)
+    x[:count] = across * width - 0.5
+    y[:count] = down * height - 0.5
     flat = cv2.remap(texture, x.reshape(shape), y.reshape(shape), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return flat.reshape(-1, 3)[:count]
+    colours = flat.reshape(-1, 3)[:count]
+    return colours.astype(np.float32) / 255 if texture.dtype == np.uint8 else colours
 
 
 def lambert(
     albedo: Float[np.ndarray, "S 3"], cosine: Float[np.ndarray, "S"], visible: Float[np.ndarray, "S"], lamp: Lamp
 ) -> Float[np.ndarray, "S 3"]:
-    """Radiance of matte surfaces.
+    """Compute the radiance of matte surfaces.
 
     Args:
         albedo: linear, in [0, 1].
@@ -131,25 +151,12 @@ def lambert(
     return radiance if lamp.colour == WHITE else radiance * np.array(lamp.colour, radiance.dtype)
 
 
-# One textured mesh as rays meet it: intersection and occlusion by Embree, prefiltered texture lookup.
+# Rays and one textured mesh: intersection and occlusion by Embree, prefiltered texture lookup.
 #
 # The ray structure is built once per object, in the object's own frame; scenes move rays, not meshes.
 
 
 NO_HIT = np.float32(1e30)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Surface:
-    """What rays hit.
-
-    Attributes:
-        normals: smooth unit normals in the object frame, turned toward the side that was hit.
-        uv: texture coordinates, v upwards.
-    """
-
-    normals: Float[np.ndarray, "S 3"]
-    uv: Float[np.ndarray, "S 2"]
 
 
 class TracedMesh:
@@ -177,7 +184,7 @@ class TracedMesh:
     def intersect(
         self, origins: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "S 3"]
     ) -> tuple[Float[np.ndarray, "S"], Int[np.ndarray, "S"], Float[np.ndarray, "S 2"]]:
-        """First hit of each ray: distance [ray lengths] or NO_HIT, face index, barycentric coordinates."""
+        """Find the first hit of each ray: distance [ray lengths] or NO_HIT, face index, barycentric coordinates."""
         hits = self._scene.run(origins, directions, output=1)
         missed = hits["primID"] < 0
         distance = np.where(missed, NO_HIT, hits["tfar"])
@@ -186,18 +193,21 @@ class TracedMesh:
     def occludes(
         self, origins: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "S 3"], end: float | None = None
     ) -> Bool[np.ndarray, "S"]:
-        """Whether the mesh stands in each ray's way, before it ends [ray lengths] if it does."""
+        """Return whether the mesh stands in each ray's way, up to `end` [ray lengths] if it is given."""
         return self._scene.run(origins, directions, end, query="OCCLUDED") >= 0
 
     def surface(
         self, faces: Int[np.ndarray, "S"], barycentric: Float[np.ndarray, "S 2"], directions: Float[np.ndarray, "S 3"]
-    ) -> Surface:
-        """Interpolated normals and texture coordinates where rays hit.
+    ) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 2"]]:
+        """Interpolate normals and texture coordinates where rays hit.
 
         Args:
             faces: that were hit.
             barycentric: weights of each face's second and third corner.
             directions: of the rays in the object's frame.
+
+        Returns:
+            Smooth unit normals in the object's frame, toward the side that was hit; texture coordinates, v upwards.
         """
         u, v = barycentric[:, :1], barycentric[:, 1:]
         weights = np.concatenate([1 - u - v, u, v], axis=1)[:, :, None]
@@ -206,38 +216,29 @@ class TracedMesh:
         # Which side was hit is decided by the flat face: smooth normals tilt away from the eye at silhouettes.
         behind = np.einsum("ij,ij->i", self._face_normals[faces], directions) > 0
         normals[behind] *= -1
-        return Surface(normals, (self._corner_uv[faces] * weights).sum(axis=1))
+        return normals, (self._corner_uv[faces] * weights).sum(axis=1)
 
     def albedo(self, uv: Float[np.ndarray, "S 2"], footprint_m: float) -> Float[np.ndarray, "S 3"]:
-        """Texture colours averaged over about `footprint_m` [m] on the surface; 0 takes the finest level."""
-        level = float(np.log2(max(footprint_m * self._texels_per_m, 1.0)))
-        level = min(level, len(self._pyramid) - 1.0)
-        fine = int(level)
-        colours = _bilinear_at_uv(self._pyramid[fine], uv)
-        if level > fine:
-            colours += (level - fine) * (_bilinear_at_uv(self._pyramid[fine + 1], uv) - colours)
-        return colours
+        """Average texture colours over about `footprint_m` [m] on the surface; 0 takes the finest level."""
+        return _trilinear(self._pyramid, uv[:, 0], 1 - uv[:, 1], footprint_m * self._texels_per_m)
 
-    def screen_box(
-        self, T_camera_object: Pose, intrinsics: Float[np.ndarray, "3 3"], width: int, height: int
-    ) -> tuple[int, int, int, int] | None:
-        """Pixel rectangle (left, top, right, bottom; right and bottom excluded) that holds the mesh.
+    def screen_box(self, pose: Pose, camera: Camera) -> tuple[int, int, int, int] | None:
+        """Return the pixel rectangle (left, top, right, bottom; right and bottom excluded) that holds the mesh.
 
         None where it is out of view. The whole image where the mesh reaches behind the camera.
 
         Args:
-            T_camera_object: pose in the camera's frame (OpenCV axes) [m].
-            intrinsics: camera matrix [px].
-            width: of the image [px].
-            height: of the image [px].
+            pose: `T_world_object`.
+            camera: the view.
         """
+        width, height = camera.width, camera.height
         corners = np.stack(np.meshgrid(*self.bounds.T, indexing="ij"), axis=-1).reshape(-1, 3)
-        points = T_camera_object.apply(corners)
+        points = (camera.T_world_camera.inverse() @ pose).apply(corners)
         if points[:, 2].max() <= 0:
             return None
         if points[:, 2].min() <= 1e-3:
             return 0, 0, width, height
-        pixels = points @ intrinsics.T
+        pixels = points @ camera.intrinsics.T
         pixels = pixels[:, :2] / pixels[:, 2:]
         left, top = np.clip(np.floor(pixels.min(0)).astype(int), 0, (width, height))
         right, bottom = np.clip(np.ceil(pixels.max(0)).astype(int), 0, (width, height))
@@ -247,10 +248,10 @@ class TracedMesh:
 def into_frame(
     pose: Pose, origins: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "S 3"]
 ) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S 3"]]:
-    """World rays in the frame of an object, contiguous float32 as Embree wants them.
+    """Move world rays into the frame of an object, contiguous float32 for Embree.
 
     Args:
-        pose: T_world_object.
+        pose: `T_world_object`.
         origins: in the world [m].
         directions: in the world, of any length, which they keep.
     """
@@ -259,37 +260,14 @@ def into_frame(
     return np.ascontiguousarray((origins - position) @ rotation), np.ascontiguousarray(directions @ rotation)
 
 
-def _mip_pyramid(texture: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The texture and its halvings down to 1 texel, each level the area average of the one before."""
-    levels = [np.ascontiguousarray(texture)]
-    while max(levels[-1].shape[:2]) > 1:
-        height, width = levels[-1].shape[:2]
-        half = (max(width // 2, 1), max(height // 2, 1))
-        levels.append(cv2.resize(levels[-1], half, interpolation=cv2.INTER_AREA))
-    return tuple(levels)
-
-
 def _texels_per_metre(mesh: TexturedMesh) -> float:
-    """Mean texture density: square root of texture area [texel^2] over surface area [m^2]."""
+    """Compute the mean texture density: square root of texture area [texel^2] over surface area [m^2]."""
     corners = mesh.vertices[mesh.faces].astype(float)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     height, width = mesh.texture.shape[:2]
     uv = mesh.uv[mesh.faces].astype(float) * (width, height)
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     return float(np.sqrt(max(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), 1e-12) / max(area, 1e-12)))
-
-
-def _bilinear_at_uv(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] of an 8-bit image at texture coordinates, clamped at its border."""
-    height, width = image.shape[:2]
-    count = len(uv)
-    rows = -(-count // _REMAP_COLUMNS)
-    x, y = np.zeros((2, rows * _REMAP_COLUMNS), np.float32)
-    x[:count] = uv[:, 0] * width - 0.5
-    y[:count] = (1 - uv[:, 1]) * height - 0.5
-    shape = (rows, _REMAP_COLUMNS)
-    flat = cv2.remap(image, x.reshape(shape), y.reshape(shape), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return flat.reshape(-1, 3)[:count].astype(np.float32) / 255
 
 
 # The pusher: a known cylinder, drawn, shading and colliding like everything else.
@@ -299,7 +277,7 @@ _SIDES = 96
 
 
 def pusher_mesh() -> TexturedMesh:
-    """The cylinder around its centre, with a round wall, flat caps and one colour."""
+    """Build the cylinder around its centre, with a round wall, flat caps and one colour."""
     angles = np.linspace(0, 2 * np.pi, _SIDES, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     half = PUSHER_HEIGHT_M / 2
@@ -325,7 +303,7 @@ def pusher_mesh() -> TexturedMesh:
     )
 
 
-# One view to trace: which bodies, from where, under which light; its rays and shadows.
+# One view to trace: its bodies, camera and light; its rays and shadows.
 
 
 _CHUNK = 1 << 17  # samples traced at once, to bound memory at large image sizes
@@ -336,8 +314,8 @@ class Body:
     """A mesh at its place in one scene.
 
     Attributes:
-        mesh: what rays meet.
-        pose: T_world_object.
+        mesh: the shape.
+        pose: `T_world_object`.
     """
 
     mesh: TracedMesh
@@ -359,7 +337,7 @@ class PixelSamples:
     points: Float[np.ndarray, "S 2"]
 
     def means(self, values: Float[np.ndarray, "S C"]) -> Float[np.ndarray, "P C"]:
-        """Means over each pixel's samples, as a matrix product: numpy reduces short axes slowly."""
+        """Average over each pixel's samples, as a matrix product: numpy reduces short axes slowly."""
         channels, pixels = values.shape[1], len(self.rows)
         per_pixel = len(values) // pixels
         average = np.tile(np.eye(channels, dtype=np.float32), (per_pixel, 1)) / np.float32(per_pixel)
@@ -371,11 +349,11 @@ class Shot:
     """One view to trace.
 
     Attributes:
-        bodies: what is in the scene.
+        bodies: of the scene.
         light: unit vector toward the light, float32.
         camera: the view.
         lamp: how strongly, and in which colour, the scene is lit.
-        table: what the table looks like; None where there is none.
+        table: the look of the table; None where there is none.
         samples: along each side of a pixel.
         sharp: take textures at their finest level and sample every pixel alike.
         spot: a near lamp in the place of the distant light.
@@ -397,17 +375,17 @@ class Shot:
 
     @property
     def pixels_to_world(self) -> Float[np.ndarray, "3 3"]:
-        """Maps homogeneous pixel coordinates to directions in the world."""
+        """Matrix from homogeneous pixel coordinates to directions in the world."""
         inverse = np.linalg.inv(self.camera.intrinsics)
         return quaternion_to_matrix(self.camera.T_world_camera.quaternion) @ inverse
 
     def directions(self, points: Float[np.ndarray, "S 2"]) -> Float[np.ndarray, "S 3"]:
-        """World directions through pixel coordinates, scaled so that the ray parameter is the depth along z."""
+        """Return world directions through pixel coordinates, scaled so that the ray parameter is the depth along z."""
         homogeneous = np.concatenate([points, np.ones((len(points), 1), np.float32)], axis=1)
         return homogeneous @ self.pixels_to_world.T.astype(np.float32)
 
     def sampled(self, pixels: Bool[np.ndarray, "h w"]) -> Iterator[PixelSamples]:
-        """Grids of samples in the chosen pixels, some pixels at a time."""
+        """Yield grids of samples in the chosen pixels, some pixels at a time."""
         rows, columns = np.nonzero(pixels)
         side = self.samples
         offsets = (np.arange(side) + 0.5) / side
@@ -421,14 +399,14 @@ class Shot:
     def incidence(
         self, points: Float[np.ndarray, "S 3"], normals: Float[np.ndarray, "S 3"] | Float[np.ndarray, "3"]
     ) -> Float[np.ndarray, "S"]:
-        """Cosine of the light's angle to the normals at points, times a near lamp's falloff and cone."""
+        """Return the cosine of the light's angle to the normals at points, times a near lamp's falloff and cone."""
         if self.spot is None:
             return normals @ self.light
         cosine = np.sum(normals * self.spot.toward(points), axis=-1)
         return (cosine * self.spot.falloff(points) * self.spot.spot_factor(points)).astype(np.float32)
 
     def lit(self, points: Float[np.ndarray, "S 3"], receiver: int | None) -> Float[np.ndarray, "S"]:
-        """1 where the light reaches world points, 0 where a body stands in the way (the receiver itself included).
+        """Return 1 where the light reaches world points, 0 where a body (also the receiver itself) stands in the way.
 
         Args:
             points: on a surface [m].
@@ -447,13 +425,13 @@ class Shot:
         return lit
 
     def _to_light(self, points: Float[np.ndarray, "S 3"]) -> tuple[Float[np.ndarray, "S 3"], float | None]:
-        """Rays from points toward the light, and where they end [ray lengths]."""
+        """Return rays from points toward the light, and where they end [ray lengths]."""
         if self.spot is None:
             return np.broadcast_to(self.light, points.shape), None
         return self.spot.position.astype(np.float32) - points, 1.0
 
     def _may_shade(self, body: Body, points: Float[np.ndarray, "S 3"]) -> Bool[np.ndarray, "S"]:
-        """Whether the ray from each point toward the light passes through the body's bounding sphere."""
+        """Return whether the ray from each point toward the light passes through the body's bounding sphere."""
         to_centre, radius = body.pose.position.astype(np.float32) - points, body.mesh.radius_m
         if self.spot is None:
             along = to_centre @ self.light
@@ -476,7 +454,7 @@ _DARKER = (0.85, 1.0, 1.2)  # dark wood is redder: blue loses more than red
 
 
 def wooden_texture(rng: np.random.Generator, side: int = 1024) -> Float[np.ndarray, "side side 3"]:
-    """An albedo for a `TableSurface`, as bright and of the same colour as the usual table in the mean.
+    """Draw an albedo for a `TableSurface` whose mean is about that of the usual table.
 
     Args:
         rng: draws the boards.
@@ -485,17 +463,16 @@ def wooden_texture(rng: np.random.Generator, side: int = 1024) -> Float[np.ndarr
     edges = np.round(np.linspace(0, side, _ROWS + 1)).astype(int)
     shade = np.empty((side, side), np.float32)
     for top, bottom in pairwise(edges):
-        end = int(rng.integers(side // 5, side - side // 5))  # where one board of the row ends and the next begins
+        end = int(rng.integers(side // 5, side - side // 5))  # of the row's first board
         shade[top:bottom, :end] = _board(rng, bottom - top, end, side)
         shade[top:bottom, end:] = _board(rng, bottom - top, side - end, side)
-    texture = np.array(TABLE_ALBEDO, np.float32) * (
-        1 + (shade - shade.mean())[..., None] * np.array(_DARKER, np.float32)
-    )
+    contrast = (shade - shade.mean())[..., None] * np.array(_DARKER, np.float32)
+    texture = np.array(TABLE_ALBEDO, np.float32) * (1 + contrast)
     return np.clip(texture, 0, 1).astype(np.float32)
 
 
 def _board(rng: np.random.Generator, height: int, width: int, side: int) -> Float[np.ndarray, "height width"]:
-    """Relative brightness of one board along x, less 1, with a joint at its top and left."""
+    """Draw the relative brightness of one board along x, less 1, with a joint at its top and left."""
     texel = 1024 / side  # sizes below are in texels of a texture of 1024
     y = np.arange(height)[:, None] * texel
     bent = y + 9 * _noise(rng, height, width, 40 / texel, 250 / texel)  # rings meander along the board
@@ -508,75 +485,61 @@ def _board(rng: np.random.Generator, height: int, width: int, side: int) -> Floa
 
 
 def _noise(rng: np.random.Generator, height: int, width: int, across: float, along: float) -> np.ndarray:
-    """Smooth noise of standard deviation 1 that changes within these distances across and along the board [texels]."""
+    """Draw smooth noise of standard deviation 1 with these correlation lengths across and along the board [texels]."""
     coarse = rng.standard_normal((round(height / across) + 2, round(width / along) + 2))
     smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     return smooth / max(smooth.std(), 1e-9)
 
 
-# The table as rays meet it: where, in light or in shadow, and how bright; the open table without sampling.
+# The table along rays: where they meet it, in light or in shadow, and how bright; the open table without sampling.
 
 
 _BACKGROUND = -1.0
 _UP = np.array([0, 0, 1], np.float32)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class TableHits:
-    """What rays see of the table, or beside it.
+def _see_table(
+    shot: Shot, directions: Float[np.ndarray, "S 3"]
+) -> tuple[Float[np.ndarray, "S"], Float[np.ndarray, "S 3"], Float[np.ndarray, "S"]]:
+    """Trace rays that no body stops.
 
-    Attributes:
-        kind: background (-1), table in shadow (0) or in light (1).
-        colour: radiance.
-        depth: along the camera's z axis [m]; infinite beside the table.
+    Returns:
+        Background (-1), table in shadow (0) or in light (1); radiance; depth along the camera's z axis [m], infinite
+        beside the table.
     """
-
-    kind: Float[np.ndarray, "S"]
-    colour: Float[np.ndarray, "S 3"]
-    depth: Float[np.ndarray, "S"]
-
-
-def see_table(shot: Shot, directions: Float[np.ndarray, "S 3"]) -> TableHits:
-    """The table along rays that no body stops."""
     origin = shot.origin
-    falling = directions[:, 2] < -1e-9
+    falling = (directions[:, 2] < -1e-9) & (origin[2] > 0)  # a camera below the table sees no table
     depth = np.where(falling, -origin[2] / np.where(falling, directions[:, 2], -1), np.inf).astype(np.float32)
-    if origin[2] <= 0:  # a camera below the table sees no table
-        depth[:] = np.inf
-    reach = np.where(falling, depth, 0) if origin[2] > 0 else np.zeros_like(depth)
-    points = origin + reach[:, None] * directions
+    points = origin + np.where(falling, depth, 0)[:, None] * directions
     half = TABLE_SIDE_M / 2
     on_table = np.isfinite(depth) & (np.abs(points[:, 0]) <= half) & (np.abs(points[:, 1]) <= half)
     kind = np.full(len(depth), _BACKGROUND, np.float32)
     kind[on_table] = shot.lit(points[on_table], None)
-    colour = np.empty((len(depth), 3), np.float32)
-    colour[:] = BACKGROUND_RADIANCE
+    colour = np.full((len(depth), 3), BACKGROUND_RADIANCE, np.float32)
     colour[on_table] = _radiance(shot, _albedo(shot, points[on_table, :2]), points[on_table], kind[on_table])
-    return TableHits(kind, colour, np.where(on_table, depth, np.inf).astype(np.float32))
+    return kind, colour, np.where(on_table, depth, np.inf).astype(np.float32)
 
 
-def open_table(shot: Shot, near_body: np.ndarray, rgb: np.ndarray, depth: np.ndarray) -> Bool[np.ndarray, "h w"]:
+def _open_table(shot: Shot, near_body: Bool[np.ndarray, "h w"], picture: Picture) -> Bool[np.ndarray, "h w"]:
     """Fill pixels without body from their four corners; return those whose corners disagree.
 
-    Light arrives all over a pixel whose corners agree, or nowhere in it; there only what changes from place to place is
-    sampled: a texture, and a near lamp's light.
+    A pixel whose corners agree is all in light or all in shadow. There only a texture and a near lamp's light, which
+    change from place to place, are sampled.
     """
-    height, width = near_body.shape
-    y, x = np.mgrid[: height + 1, : width + 1]
-    seen = see_table(shot, shot.directions(np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)))
-    kind = seen.kind.reshape(height + 1, width + 1)
+    corner = (near_body.shape[0] + 1, near_body.shape[1] + 1)
+    kind, colour, distance = _see_table(shot, shot.directions(_grid(0, 0, corner[1], corner[0])))
+    kind, distance = kind.reshape(corner), distance.reshape(corner)
     corners = np.stack([kind[:-1, :-1], kind[:-1, 1:], kind[1:, :-1], kind[1:, 1:]])
-    busy = (corners[1] != corners[0]) | (corners[2] != corners[0]) | (corners[3] != corners[0])
-    rgb[:] = seen.colour.reshape(height + 1, width + 1, 3)[:-1, :-1]
-    distance = seen.depth.reshape(height + 1, width + 1)
-    depth[:] = (distance[:-1, :-1] + distance[:-1, 1:] + distance[1:, :-1] + distance[1:, 1:]) / 4
+    busy = np.any(corners[1:] != corners[0], axis=0)
+    picture.rgb[:] = colour.reshape(*corner, 3)[:-1, :-1]
+    picture.depth[:] = (distance[:-1, :-1] + distance[:-1, 1:] + distance[1:, :-1] + distance[1:, 1:]) / 4
     if shot.spot is not None or (shot.table is not None and shot.table.texture is not None):
-        _fill_open(shot, (corners[0] != _BACKGROUND) & ~busy & ~near_body, corners[0], rgb)
+        _fill_open(shot, (corners[0] != _BACKGROUND) & ~busy & ~near_body, corners[0], picture.rgb)
     return busy
 
 
 def _fill_open(shot: Shot, pixels: Bool[np.ndarray, "h w"], kind: np.ndarray, rgb: np.ndarray) -> None:
-    """Fill pixels that show nothing but table, each all in light or all in shadow as `kind` tells."""
+    """Fill pixels that show nothing but table; `kind` is 1 for those in light and 0 for those in shadow."""
     for samples in shot.sampled(pixels):
         points = cv2.perspectiveTransform(samples.points[None], _pixels_to_table(shot))[0]
         chosen, albedo = (samples.rows, samples.columns), _albedo(shot, points)
@@ -589,14 +552,14 @@ def _fill_open(shot: Shot, pixels: Bool[np.ndarray, "h w"], kind: np.ndarray, rg
 
 
 def _pixels_to_table(shot: Shot) -> Float[np.ndarray, "3 3"]:
-    """Maps homogeneous pixel coordinates to those of the table's plane [m]: where o - d o_z / d_z lies for a ray d."""
+    """Return the homography from pixels to the table's plane [m]: a ray o + t d meets it at o - d o_z / d_z."""
     d, o = shot.pixels_to_world, shot.camera.T_world_camera.position
     return np.stack([o[0] * d[2] - o[2] * d[0], o[1] * d[2] - o[2] * d[1], d[2]])
 
 
 def _albedo(shot: Shot, points: Float[np.ndarray, "S 2"]) -> Float[np.ndarray, "S 3"]:
-    """Of points of the table, averaged over what lies between two samples in the middle of the table."""
-    assert shot.table is not None
+    """Return the albedo of points of the table, averaged over the distance of samples in the table's middle."""
+    assert shot.table is not None  # for the type checker: only views of a table come here
     spacing_m = float(np.linalg.norm(shot.origin)) / float(shot.camera.intrinsics[1, 1]) / shot.samples
     return shot.table.albedo_at(points, 0.0 if shot.sharp else spacing_m)
 
@@ -604,17 +567,15 @@ def _albedo(shot: Shot, points: Float[np.ndarray, "S 2"]) -> Float[np.ndarray, "
 def _radiance(
     shot: Shot, albedo: Float[np.ndarray, "S 3"], points: Float[np.ndarray, "_ _"], visible: Float[np.ndarray, "S"]
 ) -> Float[np.ndarray, "S 3"]:
-    """Of the table at points of it, which only a near lamp asks for."""
+    """Return the radiance of the table; its points [m] matter under a near lamp alone."""
     incidence = np.full(len(albedo), shot.light[2], np.float32) if shot.spot is None else shot.incidence(points, _UP)
     return lambert(albedo, incidence, visible, shot.lamp)
 
 
-# Pictures of a tabletop by ray tracing: anti-aliased, textured, with exact shadows of a parallel light or a near
-# lamp.
+# Pictures of a tabletop: anti-aliased, textured, with exact shadows of a parallel light or a near lamp.
 #
 # This is the image model of object image sets, scenes and goals alike. Pixels that an object may cover, and those
-# where a shadow or the table's edge crosses, take a grid of samples each; the open table is known in closed form.
-# Depth and coverage come with the picture for tests and evaluation; observations leave them out.
+# that a shadow's or the table's edge crosses, take a grid of samples each; the open table is known in closed form.
 
 
 DEFAULT_SAMPLES = 3  # samples along each side of a pixel, in images of 96 pixels and more
@@ -643,7 +604,7 @@ class RayTracer:
     Args:
         meshes: the objects that scenes may name.
         lamp: strengths of ambient and diffuse light, and their colour; the usual ones if None.
-        table: what the table looks like; the usual one if None.
+        table: the look of the table; the usual one if None.
         spot: a near lamp in the place of the light of every state.
         executor: traces the views of one call side by side, if given (threads serve: Embree releases the GIL).
     """
@@ -673,7 +634,7 @@ class RayTracer:
             state: objects, light and pusher (drawn if it is not None).
             cameras: the views.
             samples: samples along each side of a pixel; by default 3, and more in small images.
-            sharp: take textures at their finest level and sample every pixel alike: slow, the yardstick of tests.
+            sharp: take textures at their finest level and sample every pixel alike: slow, a reference.
 
         Raises:
             KeyError: if the state names an object without mesh.
@@ -684,8 +645,7 @@ class RayTracer:
         light = state.light.direction.astype(np.float32)
         lamp, table, spot = self._lamp, self._table, self._spot
         shots = [Shot(tuple(bodies), light, c, lamp, table, samples or _samples_for(c), sharp, spot) for c in cameras]
-        mapped = map(_trace, shots) if self._executor is None else self._executor.map(_trace, shots)
-        return tuple(mapped)
+        return tuple(map(_trace, shots) if self._executor is None else self._executor.map(_trace, shots))
 
     def render_alone(
         self, name: str, light_direction: Float[np.ndarray, "3"], camera: Camera, *, samples: int = DEFAULT_SAMPLES
@@ -711,7 +671,7 @@ def _samples_for(camera: Camera) -> int:
 
 
 def masks_of(picture: Picture, count: int) -> Bool[np.ndarray, "N h w"]:
-    """Binary masks of the first `count` bodies: a pixel belongs to what covers most of it, if that is half or more."""
+    """Return masks of the first `count` bodies: a pixel is of the body that covers most of it, if half or more."""
     coverage = picture.coverage[:count]
     if count == 0:
         return np.zeros(coverage.shape, bool)
@@ -720,81 +680,78 @@ def masks_of(picture: Picture, count: int) -> Bool[np.ndarray, "N h w"]:
 
 
 def _trace(shot: Shot) -> Picture:
-    """One view: closed-form table first, then grids of samples where something happens."""
+    """Trace one view: the closed-form table first, then grids of samples where bodies or edges are."""
     height, width = shot.camera.height, shot.camera.width
     near_body = np.ones((height, width), bool) if shot.sharp else _near_bodies(shot)
-    rgb = np.zeros((height, width, 3), np.float32)
-    depth = np.full((height, width), np.inf, np.float32)
-    coverage = np.zeros((len(shot.bodies), height, width), np.float32)
+    picture = Picture(
+        np.zeros((height, width, 3), np.float32),
+        np.zeros((len(shot.bodies), height, width), np.float32),
+        np.full((height, width), np.inf, np.float32),
+    )
     if shot.table is not None:
-        busy = open_table(shot, near_body, rgb, depth)
-        _sampled(shot, busy & ~near_body, (), rgb, depth, coverage)
-    _sampled(shot, near_body, tuple(range(len(shot.bodies))), rgb, depth, coverage)
-    return Picture(rgb, coverage, depth)
+        busy = _open_table(shot, near_body, picture)
+        _sample(shot, busy & ~near_body, (), picture)
+    _sample(shot, near_body, tuple(range(len(shot.bodies))), picture)
+    return picture
 
 
 def _near_bodies(shot: Shot) -> Bool[np.ndarray, "h w"]:
-    """Pixels that a body may cover: those with a corner on one, and their neighbours."""
+    """Find pixels that a body may cover: those with a corner on one, and their neighbours."""
     height, width = shot.camera.height, shot.camera.width
     on_body = np.zeros((height + 1, width + 1), bool)
     for body in shot.bodies:
-        box = _screen_box(body, shot.camera)
-        if box is not None:
-            left, top, right, bottom = box
-            if min(height, width) < _SMALL_SIDE:
-                on_body[top : bottom + 1, left : right + 1] = True
-                continue
-            y, x = np.mgrid[top : bottom + 1, left : right + 1]
-            directions = shot.directions(np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32))
-            origins = np.broadcast_to(shot.origin, directions.shape)
-            hit = body.mesh.occludes(*into_frame(body.pose, origins, directions))
-            on_body[top : bottom + 1, left : right + 1] |= hit.reshape(x.shape)
+        box = body.mesh.screen_box(body.pose, shot.camera)
+        if box is None:
+            continue
+        left, top, right, bottom = box
+        if min(height, width) < _SMALL_SIDE:
+            on_body[top : bottom + 1, left : right + 1] = True
+            continue
+        corners = on_body[top : bottom + 1, left : right + 1]
+        directions = shot.directions(_grid(left, top, right + 1, bottom + 1))
+        origins = np.broadcast_to(shot.origin, directions.shape)
+        corners |= body.mesh.occludes(*into_frame(body.pose, origins, directions)).reshape(corners.shape)
     pixels = on_body[:-1, :-1] | on_body[:-1, 1:] | on_body[1:, :-1] | on_body[1:, 1:]
     return cv2.dilate(pixels.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
 
 
-def _screen_box(body: Body, camera: Camera) -> tuple[int, int, int, int] | None:
-    T_camera_object = camera.T_world_camera.inverse() @ body.pose
-    return body.mesh.screen_box(T_camera_object, camera.intrinsics, camera.width, camera.height)
+def _grid(left: int, top: int, right: int, bottom: int) -> Float[np.ndarray, "S 2"]:
+    """Return the pixel coordinates of the corners in a rectangle, row by row; right and bottom are excluded."""
+    y, x = np.mgrid[top:bottom, left:right]
+    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
 
 
-def _sampled(
-    shot: Shot,
-    pixels: Bool[np.ndarray, "h w"],
-    visible: tuple[int, ...],
-    rgb: np.ndarray,
-    depth: np.ndarray,
-    coverage: np.ndarray,
-) -> None:
+def _sample(shot: Shot, pixels: Bool[np.ndarray, "h w"], visible: tuple[int, ...], picture: Picture) -> None:
     """Fill the chosen pixels with the mean of a grid of samples; `visible` are the bodies they may show."""
     for samples in shot.sampled(pixels):
         chosen = samples.rows, samples.columns
         colour, z, owner = _shade(shot, samples.points, visible)
-        rgb[chosen] = samples.means(colour)
+        picture.rgb[chosen] = samples.means(colour)
         hit = np.isfinite(z)
         share = samples.means(hit[:, None].astype(np.float32))[:, 0]
         total = samples.means(np.where(hit, z, 0)[:, None])[:, 0]
-        depth[chosen] = np.where(share > 0, total / np.maximum(share, 1e-6), np.inf)
+        picture.depth[chosen] = np.where(share > 0, total / np.maximum(share, 1e-6), np.inf)
         owned = owner[:, None] == np.array(visible)
-        coverage[visible, samples.rows[:, None], samples.columns[:, None]] = samples.means(owned.astype(np.float32))
+        places = visible, samples.rows[:, None], samples.columns[:, None]
+        picture.coverage[places] = samples.means(owned.astype(np.float32))
 
 
 def _shade(
     shot: Shot, points: Float[np.ndarray, "S 2"], visible: tuple[int, ...]
 ) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"], np.ndarray]:
-    """Radiance, depth and owner (index of the body, or -1) of the samples at pixel coordinates."""
+    """Compute radiance, depth and owner (index of the body, or -1) of the samples at pixel coordinates."""
     directions = shot.directions(points)
     nearest = np.full(len(points), NO_HIT, np.float32)
     owner = np.full(len(points), -1)
     face = np.zeros(len(points), np.int64)
     barycentric = np.zeros((len(points), 2), np.float32)
     for i in visible:
-        inside = np.arange(len(points)) if shot.sharp else _inside_box(shot, i, points)
+        body = shot.bodies[i]
+        inside = np.arange(len(points)) if shot.sharp else _inside_box(shot, body, points)
         if len(inside) == 0:
             continue
         origins = np.broadcast_to(shot.origin, (len(inside), 3))
-        local_origins, local_directions = into_frame(shot.bodies[i].pose, origins, directions[inside])
-        distance, hit_face, hit_uv = shot.bodies[i].mesh.intersect(local_origins, local_directions)
+        distance, hit_face, hit_uv = body.mesh.intersect(*into_frame(body.pose, origins, directions[inside]))
         closer = distance < nearest[inside]
         chosen = inside[closer]
         nearest[chosen], owner[chosen] = distance[closer], i
@@ -805,8 +762,7 @@ def _shade(
         # Bodies stand on the table, so it is only seen where no body was hit, or below the table.
         owner[(owner >= 0) & ~_above_table(shot, directions, nearest)] = -1
         open_rays = np.nonzero(owner < 0)[0]
-        seen = see_table(shot, directions[open_rays])
-        colour[open_rays], depth[open_rays] = seen.colour, seen.depth
+        _, colour[open_rays], depth[open_rays] = _see_table(shot, directions[open_rays])
     for i in visible:
         mine = np.nonzero(owner == i)[0]
         if len(mine):
@@ -816,13 +772,14 @@ def _shade(
 
 
 def _above_table(shot: Shot, directions: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, "S"]:
-    """Whether hits lie above the table's plane: a body that sinks a fraction of a millimetre does not shine through."""
+    """Return which hits lie above the table's plane: a body that sinks in a little does not shine through."""
     z = shot.origin[2] + np.where(distance < NO_HIT, distance, 0) * directions[:, 2]
     return z > -1e-4 if shot.origin[2] > 0 else np.ones(len(z), bool)
 
 
-def _inside_box(shot: Shot, index: int, points: Float[np.ndarray, "S 2"]) -> np.ndarray:
-    box = _screen_box(shot.bodies[index], shot.camera)
+def _inside_box(shot: Shot, body: Body, points: Float[np.ndarray, "S 2"]) -> np.ndarray:
+    """Return the indices of pixel coordinates inside a body's rectangle."""
+    box = body.mesh.screen_box(body.pose, shot.camera)
     if box is None:
         return np.zeros(0, np.int64)
     left, top, right, bottom = box
@@ -833,13 +790,13 @@ def _inside_box(shot: Shot, index: int, points: Float[np.ndarray, "S 2"]) -> np.
 def _body_colour(
     shot: Shot, index: int, directions: np.ndarray, distance: np.ndarray, face: np.ndarray, barycentric: np.ndarray
 ) -> Float[np.ndarray, "S 3"]:
-    """Radiance of hits on one body."""
+    """Compute the radiance of hits on one body."""
     body = shot.bodies[index]
     rotation = quaternion_to_matrix(body.pose.quaternion).astype(np.float32)
-    surface = body.mesh.surface(face, barycentric, directions @ rotation)
-    normals = surface.normals @ rotation.T
+    local_normals, uv = body.mesh.surface(face, barycentric, directions @ rotation)
+    normals = local_normals @ rotation.T
     spacing_m = float(distance.mean()) / shot.camera.intrinsics[1, 1] / shot.samples
-    albedo = body.mesh.albedo(surface.uv, 0.0 if shot.sharp else spacing_m)
+    albedo = body.mesh.albedo(uv, 0.0 if shot.sharp else spacing_m)
     points = shot.origin + distance[:, None] * directions
     incidence = shot.incidence(points, normals)
     visible = np.zeros(len(distance), np.float32)

@@ -9,13 +9,15 @@ object and pusher. Rolling friction is a lever arm [m] chosen so that cans and f
 
 from __future__ import annotations
 
+import functools
+import importlib
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,35 +27,24 @@ from osfcore.geometry.poses import Pose, quaternion_from_matrix, rotate
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S, TABLE_SIDE_M
 from osfcore.objects.asset import ObjectAsset
 
-# PyBullet, imported without the line about its build that it writes to stderr each time.
 
-
-@contextmanager
-def _nothing_said() -> Iterator[None]:
-    """Let the descriptor of stderr lead nowhere, for C code writes to it."""
+def _import_quietly() -> ModuleType:
+    """Import PyBullet without the line about its build, which its C code writes to stderr."""
     try:
-        kept = os.dup(2)
+        stderr = os.dup(2)
     except OSError:  # a service may have been started without one
-        yield
-        return
+        return importlib.import_module("pybullet")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
-        yield
+        return importlib.import_module("pybullet")
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr, 2)
+        os.close(stderr)
         os.close(nowhere)
 
 
-def _imported() -> ModuleType:
-    with _nothing_said():
-        import pybullet
-    return pybullet
-
-
-pybullet = _imported()
-
+pybullet = _import_quietly()
 
 TIME_STEP_S = 1 / 240
 SUBSTEPS = round(STEP_S / TIME_STEP_S)
@@ -67,40 +58,47 @@ PUSHER_MASS_KG = 100.0  # so heavy that no object slows it; its pose is set exac
 COLLISION_MARGIN_M = 0.0002  # Bullet inflates convex hulls by it; larger ones make objects hover
 FLOOR_Z_M = -0.75  # where something lies that was pushed off the table
 _TABLE_THICKNESS_M = 0.1
+_REACH_M = 0.05  # gaps are measured up to this
+
+
+class BulletClient:
+    """PyBullet's functions, bound to a simulation of their own."""
+
+    def __init__(self) -> None:
+        self._id = pybullet.connect(pybullet.DIRECT)
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        """Bind a function, once: later look-ups find it among the attributes."""
+        bound = functools.partial(getattr(pybullet, name), physicsClientId=self._id)
+        setattr(self, name, bound)
+        return bound
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BodyModel:
-    """What physics needs of an object, made once: `body_model`.
+    """What physics needs of an object, made once by `body_model`.
 
     Attributes:
         mass_kg: mass [kg].
         T_object_inertial: centre of mass and principal axes in the object frame.
+        T_inertial_object: its inverse.
         moments: principal moments [kg m^2].
         hulls: convex parts as a Wavefront OBJ, one group each, around the centre of mass.
     """
 
     mass_kg: float
     T_object_inertial: Pose
+    T_inertial_object: Pose
     moments: Float[np.ndarray, "3"]
     hulls: str
 
 
 def body_model(asset: ObjectAsset) -> BodyModel:
-    """Mass properties and collision shape of an object."""
+    """Compute mass properties and collision shape of an object."""
     T_object_inertial, moments = mass_properties(asset.parts, asset.info.mass_kg)
     T_inertial_object = T_object_inertial.inverse()
     hulls = _hulls_as_obj([T_inertial_object.apply(part) for part in asset.parts])
-    return BodyModel(asset.info.mass_kg, T_object_inertial, moments, hulls)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Body:
-    """A body in the simulation and where its centre of mass sits in the object frame."""
-
-    uid: int
-    T_object_inertial: Pose
-    T_inertial_object: Pose
+    return BodyModel(asset.info.mass_kg, T_object_inertial, T_inertial_object, moments, hulls)
 
 
 class Physics:
@@ -115,47 +113,39 @@ class Physics:
     def __init__(
         self, models: Mapping[str, BodyModel], *, friction_factor: float = 1.0, mass_factor: float = 1.0
     ) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
+        self._bullet = BulletClient()
+        self._is_open = True
         self._models = dict(models)
         self._friction = friction_factor * OBJECT_FRICTION
         self._mass_factor = mass_factor
-        self._build()
+        self.reset()
 
-    def _build(self) -> None:
-        c = self._client
-        pybullet.resetSimulation(physicsClientId=c)
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP_S,
-            numSolverIterations=50,
-            deterministicOverlappingPairs=1,
-            enableFileCaching=0,
-            physicsClientId=c,
+    def reset(self) -> None:
+        """Start over from the state right after construction, with nothing on the table."""
+        bullet = self._bullet
+        bullet.resetSimulation()
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=TIME_STEP_S, numSolverIterations=50, deterministicOverlappingPairs=1, enableFileCaching=0
         )
-        pybullet.setGravity(0, 0, -GRAVITY_M_S2, physicsClientId=c)
+        bullet.setGravity(0, 0, -GRAVITY_M_S2)
         half = [TABLE_SIDE_M / 2, TABLE_SIDE_M / 2, _TABLE_THICKNESS_M / 2]
-        table_shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=c)
-        self._table = pybullet.createMultiBody(
-            0, table_shape, basePosition=[0, 0, -_TABLE_THICKNESS_M / 2], physicsClientId=c
-        )
-        self._dynamics(self._table, TABLE_FRICTION)
-        floor_shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=c)
-        floor = pybullet.createMultiBody(0, floor_shape, basePosition=[0, 0, FLOOR_Z_M], physicsClientId=c)
-        self._dynamics(floor, TABLE_FRICTION)
-        pusher_shape = pybullet.createCollisionShape(
-            pybullet.GEOM_CYLINDER, radius=PUSHER_RADIUS_M, height=PUSHER_HEIGHT_M, physicsClientId=c
-        )
-        self._pusher = pybullet.createMultiBody(
-            PUSHER_MASS_KG, pusher_shape, basePosition=[0, 0, 2.0], physicsClientId=c
-        )
-        self._dynamics(self._pusher, PUSHER_FRICTION)
-        pybullet.setCollisionFilterPair(self._pusher, self._table, -1, -1, 0, physicsClientId=c)
+        table = bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
+        self._table = bullet.createMultiBody(0, table, basePosition=[0, 0, -_TABLE_THICKNESS_M / 2])
+        self._set_contacts(self._table, TABLE_FRICTION)
+        floor_shape = bullet.createCollisionShape(pybullet.GEOM_PLANE)
+        floor = bullet.createMultiBody(0, floor_shape, basePosition=[0, 0, FLOOR_Z_M])
+        self._set_contacts(floor, TABLE_FRICTION)
         self._pusher_position = np.array([0, 0, 2.0])
-        self._bodies: dict[str, _Body] = {}
+        cylinder = bullet.createCollisionShape(pybullet.GEOM_CYLINDER, radius=PUSHER_RADIUS_M, height=PUSHER_HEIGHT_M)
+        self._pusher = bullet.createMultiBody(PUSHER_MASS_KG, cylinder, basePosition=[0, 0, 2.0])
+        self._set_contacts(self._pusher, PUSHER_FRICTION)
+        bullet.setCollisionFilterPair(self._pusher, self._table, -1, -1, 0)
+        self._uids: dict[str, int] = {}
         for name, model in self._models.items():
-            self._bodies[name] = self._add(model)
+            self._uids[name] = self._add(model)
 
-    def _dynamics(self, uid: int, friction: float) -> None:
-        pybullet.changeDynamics(
+    def _set_contacts(self, uid: int, friction: float) -> None:
+        self._bullet.changeDynamics(
             uid,
             -1,
             lateralFriction=friction,
@@ -164,33 +154,27 @@ class Physics:
             linearDamping=0,
             angularDamping=0,
             collisionMargin=COLLISION_MARGIN_M,
-            physicsClientId=self._client,
         )
 
-    def _add(self, model: BodyModel) -> _Body:
-        """One object, out of everything's way until it is placed."""
+    def _add(self, model: BodyModel) -> int:
+        """Add one object, out of everything's way until it is placed; return its Bullet id."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "parts.obj"  # Bullet makes a compound of hulls from the groups of an OBJ file
             path.write_text(model.hulls)
-            shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path), physicsClientId=self._client)
+            shape = self._bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path))
         # A visual shape of its own keeps Bullet from reading the file again for one.
-        visual = pybullet.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001, physicsClientId=self._client)
-        away = [10.0 * (1 + len(self._bodies)), 0.0, 50.0]
-        mass_kg, moments = self._mass_factor * model.mass_kg, self._mass_factor * model.moments
-        uid = pybullet.createMultiBody(mass_kg, shape, visual, away, physicsClientId=self._client)
-        self._dynamics(uid, self._friction)
-        pybullet.changeDynamics(uid, -1, localInertiaDiagonal=moments.tolist(), physicsClientId=self._client)
-        return _Body(uid, model.T_object_inertial, model.T_object_inertial.inverse())
-
-    def reset(self) -> None:
-        """Start over from the state right after construction, with nothing on the table."""
-        self._build()
+        visual = self._bullet.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001)
+        away = [10.0 * (1 + len(self._uids)), 0.0, 50.0]
+        uid = self._bullet.createMultiBody(self._mass_factor * model.mass_kg, shape, visual, away)
+        self._set_contacts(uid, self._friction)
+        self._bullet.changeDynamics(uid, -1, localInertiaDiagonal=(self._mass_factor * model.moments).tolist())
+        return uid
 
     def close(self) -> None:
         """Free the simulation."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        if self._is_open:
+            self._bullet.disconnect()
+            self._is_open = False
 
     @property
     def pusher(self) -> Float[np.ndarray, "3"]:
@@ -198,20 +182,16 @@ class Physics:
         return self._pusher_position.copy()
 
     def pose(self, name: str) -> Pose:
-        """`T_world_object`."""
-        body = self._bodies[name]
-        position, xyzw = pybullet.getBasePositionAndOrientation(body.uid, physicsClientId=self._client)
-        return Pose(np.array(position), np.array([xyzw[3], *xyzw[:3]])) @ body.T_inertial_object
+        """Return `T_world_object`."""
+        position, (x, y, z, w) = self._bullet.getBasePositionAndOrientation(self._uids[name])
+        return Pose(np.array(position), np.array([w, x, y, z])) @ self._models[name].T_inertial_object
 
     def place(self, name: str, pose: Pose) -> None:
         """Put an object at rest at `T_world_object`."""
-        body = self._bodies[name]
-        inertial = pose @ body.T_object_inertial
+        inertial = pose @ self._models[name].T_object_inertial
         w, x, y, z = inertial.quaternion
-        pybullet.resetBasePositionAndOrientation(
-            body.uid, inertial.position.tolist(), [x, y, z, w], physicsClientId=self._client
-        )
-        pybullet.resetBaseVelocity(body.uid, [0, 0, 0], [0, 0, 0], physicsClientId=self._client)
+        self._bullet.resetBasePositionAndOrientation(self._uids[name], inertial.position.tolist(), [x, y, z, w])
+        self._bullet.resetBaseVelocity(self._uids[name], [0, 0, 0], [0, 0, 0])
 
     def place_pusher(self, position: Float[np.ndarray, "3"]) -> None:
         """Put the pusher upright at rest with its centre at `position` [m]."""
@@ -219,10 +199,8 @@ class Physics:
         self._hold_pusher(np.zeros(3))
 
     def _hold_pusher(self, velocity: np.ndarray) -> None:
-        pybullet.resetBasePositionAndOrientation(
-            self._pusher, self._pusher_position.tolist(), [0, 0, 0, 1], physicsClientId=self._client
-        )
-        pybullet.resetBaseVelocity(self._pusher, velocity.tolist(), [0, 0, 0], physicsClientId=self._client)
+        self._bullet.resetBasePositionAndOrientation(self._pusher, self._pusher_position.tolist(), [0, 0, 0, 1])
+        self._bullet.resetBaseVelocity(self._pusher, velocity.tolist(), [0, 0, 0])
 
     def step(self, velocity: Float[np.ndarray, "3"]) -> frozenset[str]:
         """Advance by `TIME_STEP_S` with the pusher at a velocity [m/s]; return the objects it touched.
@@ -234,63 +212,54 @@ class Physics:
         reach = np.maximum(PUSHER_REACH_M, np.abs(start[:2]))
         goal[:2] = np.clip(goal[:2], -reach, reach)
         self._hold_pusher((goal - start) / TIME_STEP_S + [0, 0, GRAVITY_M_S2 * TIME_STEP_S])
-        pybullet.stepSimulation(physicsClientId=self._client)
+        self._bullet.stepSimulation()
         self._pusher_position = goal
         self._hold_pusher(np.zeros(3))
-        return self._touched()
-
-    def _touched(self) -> frozenset[str]:
-        contacts = pybullet.getContactPoints(bodyA=self._pusher, physicsClientId=self._client)
-        touched = {contact[2] for contact in contacts}
-        return frozenset(name for name, body in self._bodies.items() if body.uid in touched)
+        touched = {contact[2] for contact in self._bullet.getContactPoints(bodyA=self._pusher)}
+        return frozenset(name for name, uid in self._uids.items() if uid in touched)
 
     def speed(self, name: str) -> tuple[float, float]:
-        """Linear [m/s] and angular [rad/s] speed of an object."""
-        linear, angular = pybullet.getBaseVelocity(self._bodies[name].uid, physicsClientId=self._client)
+        """Return linear [m/s] and angular [rad/s] speed of an object."""
+        linear, angular = self._bullet.getBaseVelocity(self._uids[name])
         return float(np.linalg.norm(linear)), float(np.linalg.norm(angular))
 
-    def set_velocity(
-        self, name: str, linear: Float[np.ndarray, "3"], angular: Float[np.ndarray, "3"] | None = None
-    ) -> None:
+    def set_velocity(self, name: str, linear: Float[np.ndarray, "3"], angular: Float[np.ndarray, "3"]) -> None:
         """Let an object move from now on.
 
         Args:
             name: which object.
             linear: velocity of its centre of mass in the world [m/s].
-            angular: angular velocity in the world [rad/s]; 0 if None.
+            angular: angular velocity in the world [rad/s].
         """
-        turning = [0.0, 0.0, 0.0] if angular is None else angular.tolist()
-        pybullet.resetBaseVelocity(self._bodies[name].uid, linear.tolist(), turning, physicsClientId=self._client)
+        self._bullet.resetBaseVelocity(self._uids[name], linear.tolist(), angular.tolist())
 
-    def distance(self, first: str, second: str | None, reach_m: float = 0.05) -> float:
-        """Gap between two objects, or an object and the pusher [m]; negative if they penetrate.
+    def distance(self, first: str, second: str | None, reach_m: float = _REACH_M) -> float:
+        """Return the gap between two objects, or an object and the pusher [m]; negative if they penetrate.
 
         Args:
             first: an object.
             second: another object, or None for the pusher.
             reach_m: returned for gaps that are larger.
         """
-        other = self._pusher if second is None else self._bodies[second].uid
-        return self._gap(self._bodies[first].uid, other, reach_m)
-
-    def separation(self, first: str, second: str) -> tuple[float, Float[np.ndarray, "3"]]:
-        """Gap between two objects [m], 0.05 if larger, and the unit vector along which the first one leaves."""
-        ids = self._bodies[first].uid, self._bodies[second].uid
-        points = pybullet.getClosestPoints(*ids, 0.05, physicsClientId=self._client)
-        nearest = min(points, key=lambda point: point[8], default=None)
-        return (0.05, np.array([0.0, 0.0, 1.0])) if nearest is None else (nearest[8], np.array(nearest[7]))
+        return self._gap(first, self._pusher if second is None else self._uids[second], reach_m)
 
     def table_distance(self, name: str) -> float:
-        """Gap between an object and the table [m]; negative if it sinks in; 0.05 if larger."""
-        return self._gap(self._bodies[name].uid, self._table, 0.05)
+        """Return the gap between an object and the table [m]; negative if it sinks in; 0.05 if larger."""
+        return self._gap(name, self._table, _REACH_M)
 
-    def _gap(self, first: int, second: int, reach_m: float) -> float:
-        points = pybullet.getClosestPoints(first, second, reach_m, physicsClientId=self._client)
+    def _gap(self, name: str, other: int, reach_m: float) -> float:
+        points = self._bullet.getClosestPoints(self._uids[name], other, reach_m)
         return min((point[8] for point in points), default=reach_m)
+
+    def separation(self, first: str, second: str) -> tuple[float, Float[np.ndarray, "3"]]:
+        """Return the gap between two objects [m], 0.05 if larger, and the unit vector along which the first leaves."""
+        points = self._bullet.getClosestPoints(self._uids[first], self._uids[second], _REACH_M)
+        nearest = min(points, key=lambda point: point[8], default=None)
+        return (_REACH_M, np.array([0.0, 0.0, 1.0])) if nearest is None else (nearest[8], np.array(nearest[7]))
 
 
 def mass_properties(parts: tuple[Float[np.ndarray, "_ 3"], ...], mass_kg: float) -> tuple[Pose, Float[np.ndarray, "3"]]:
-    """Centre of mass with principal axes, and principal moments [kg m^2], of hulls of one uniform density.
+    """Return centre of mass with principal axes, and principal moments [kg m^2], of hulls of one uniform density.
 
     Parts are summed as if they did not overlap.
     """
@@ -315,7 +284,7 @@ def mass_properties(parts: tuple[Float[np.ndarray, "_ 3"], ...], mass_kg: float)
 
 
 def lowest_point(asset: ObjectAsset, quaternion: Float[np.ndarray, "4"]) -> float:
-    """Height of an object's lowest point relative to its frame's origin, when turned so [m]."""
+    """Return the height of an object's lowest point above its frame's origin when turned by a quaternion [m]."""
     return min(float(rotate(quaternion, part)[:, 2].min()) for part in asset.parts)
 
 

@@ -1,4 +1,4 @@
-"""What a scene is made of on request: objects, their places, light and conditions."""
+"""Scenes on request: which objects, their places at rest, light and conditions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, MissingAssets, NoRoom, OsfError, OverlappingObjects
+from osfcore.errors import InvalidInput, MissingAssets, NoRoom, OsfError, OverlappingObjects, check_ranges
 from osfcore.geometry.light import Light, SpotLamp
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import MAX_OBJECTS, SceneState
@@ -18,15 +18,12 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.imaging import Lamp, TableSurface
 from osfcore.world.physics import Physics, lowest_point
 
-# What a random scene shall contain, and whether it can.
-
-
 MAX_HEIGHT_M = 1.0  # of an object's centre when it is put somewhere by hand
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneRequest:
-    """What a random scene shall contain.
+    """Contents of a random scene.
 
     Attributes:
         names: the objects, or None for a random choice.
@@ -60,27 +57,26 @@ def check_request(library: AssetLibrary, request: SceneRequest) -> None:
         UnknownName, MissingAssets, InvalidInput: if it cannot.
     """
     if request.names is not None:
-        if not 1 <= len(request.names) <= MAX_OBJECTS:
-            raise InvalidInput("number of objects", len(request.names), f"between 1 and {MAX_OBJECTS}")
-        if len(set(request.names)) != len(request.names):
-            raise InvalidInput("list of objects", ", ".join(request.names), "without repetition")
+        check_ranges(("number of objects", len(request.names), 1, MAX_OBJECTS))
+        _check_unrepeated(request.names)
         for name in request.names:
             check_object(library, name)
         return
-    if not 1 <= request.count <= MAX_OBJECTS:
-        raise InvalidInput("number of objects", request.count, f"between 1 and {MAX_OBJECTS}")
+    check_ranges(("number of objects", request.count, 1, MAX_OBJECTS))
     choice = library.names() if request.among is None else request.among
     for name in request.among or ():
         check_object(library, name)
-    if len(set(choice)) != len(choice):
-        raise InvalidInput("list of objects", ", ".join(choice), "without repetition")
-    available = len(choice)
-    if request.among is None and available == 0:
+    _check_unrepeated(choice)
+    if request.among is None and not choice:
         raise OsfError("There are no objects on this machine yet; get them with 'osf assets fetch'.")
-    if request.count > available:
-        raise InvalidInput(
-            "number of objects", request.count, f"at most {available}, as many as there are to choose from"
-        )
+    if request.count > len(choice):
+        allowed = f"at most {len(choice)}, as many as there are to choose from"
+        raise InvalidInput("number of objects", request.count, allowed)
+
+
+def _check_unrepeated(names: tuple[str, ...]) -> None:
+    if len(set(names)) != len(names):
+        raise InvalidInput("list of objects", ", ".join(names), "without repetition")
 
 
 def check_place(name: str, position: Float[np.ndarray, "3"]) -> None:
@@ -106,12 +102,12 @@ _TRIES_PER_OBJECT = 60
 _LAYOUTS = 60
 _SETTLE_LIMIT_STEPS = 480
 _CALM_STEPS = 12
-_MOVES = 60  # until nothing penetrates any more
-_TOUCH_M = 5e-4  # so little is no penetration: shapes have a margin
-_STANDS_M = 0.01  # above the table at most, for what stands on it
-_SIDEWAYS = 0.3  # of a contact's normal from which it tells a direction
-CALM_SPEED_M_S = 2e-3
-CALM_TURN_RAD_S = 2e-2
+_MOVES = 60  # rounds of moving apart
+_TOUCH_M = 5e-4  # less is no penetration: shapes have a margin
+_STANDS_M = 0.01  # an object with a smaller gap to the table stands on it
+_SIDEWAYS = 0.3  # a part of a contact's normal that is at least so large gives the direction
+_CALM_SPEED_M_S = 2e-3
+_CALM_TURN_RAD_S = 2e-2
 
 
 def place_randomly(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator) -> None:
@@ -130,27 +126,24 @@ def place_randomly(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.
         if not _lay_out(physics, assets, rng):
             continue
         settle(physics, tuple(assets))
-        inside = all(np.abs(physics.pose(name).position[:2]).max() <= WORKSPACE_HALF_M for name in assets)
-        if inside and is_calm(physics, tuple(assets)) and _place_pusher(physics, tuple(assets), rng):
+        is_inside = all(np.abs(physics.pose(name).position[:2]).max() <= WORKSPACE_HALF_M for name in assets)
+        if is_inside and is_calm(physics, tuple(assets)) and _place_pusher(physics, tuple(assets), rng):
             return
     raise NoRoom(assets, _LAYOUTS)
 
 
-def settle(physics: Physics, names: tuple[str, ...], limit_steps: int = _SETTLE_LIMIT_STEPS) -> int:
+def settle(physics: Physics, names: tuple[str, ...]) -> int:
     """Step without pushing until nothing has moved for a twentieth of a second; return the steps taken.
 
-    Args:
-        physics: steps in place.
-        names: objects that shall come to rest.
-        limit_steps: when to give up.
+    It gives up after 2 s.
     """
     calm = 0
-    for step in range(limit_steps):
+    for step in range(_SETTLE_LIMIT_STEPS):
         if calm >= _CALM_STEPS:
             return step
         physics.step(np.zeros(3))
         calm = calm + 1 if is_calm(physics, names) else 0
-    return limit_steps
+    return _SETTLE_LIMIT_STEPS
 
 
 def refuse_overlaps(physics: Physics, names: tuple[str, ...], moved: str | None = None) -> None:
@@ -159,10 +152,10 @@ def refuse_overlaps(physics: Physics, names: tuple[str, ...], moved: str | None 
     Args:
         physics: of the bodies.
         names: of the objects.
-        moved: only pairs of which it is one are looked at; None for all.
+        moved: check only pairs with this object; None for all.
 
     Raises:
-        OverlappingObjects: if so.
+        OverlappingObjects: if bodies penetrate.
     """
     for i, first in enumerate(names):
         gaps = {second: physics.distance(first, second) for second in names[i + 1 :]}
@@ -176,8 +169,8 @@ def refuse_overlaps(physics: Physics, names: tuple[str, ...], moved: str | None 
 def move_apart(physics: Physics, names: tuple[str, ...]) -> None:
     """Lift objects that sink into the table, and move apart those that penetrate each other, as little as needed.
 
-    Of two that both stand on the table each gives way by half; of others the one that lies on the other is lifted.
-    Let go while they penetrate, they would be thrown apart.
+    Of two objects that both stand on the table each gives way by half. Otherwise the upper one is lifted.
+    Without this, physics would throw them apart.
     """
     for _ in range(_MOVES):
         is_moved = False
@@ -195,7 +188,7 @@ def move_apart(physics: Physics, names: tuple[str, ...]) -> None:
 
 
 def _separate(physics: Physics, first: str, second: str, depth_m: float, normal: Float[np.ndarray, "3"]) -> None:
-    """Move two objects along the normal that the first one leaves by; horizontally if both stand on the table."""
+    """Move two objects apart along the contact's normal (from second to first); sideways if both stand on the table."""
     if all(physics.table_distance(name) < _STANDS_M for name in (first, second)):
         apart = physics.pose(first).position - physics.pose(second).position
         aside = normal[:2] if np.linalg.norm(normal[:2]) > _SIDEWAYS else apart[:2]
@@ -209,7 +202,7 @@ def _separate(physics: Physics, first: str, second: str, depth_m: float, normal:
 
 
 def above_table(state: SceneState) -> SceneState:
-    """The state with no object's centre below the table."""
+    """Return the state with objects whose centre is below the table lifted to it."""
     positions = np.maximum(state.poses.position, [-np.inf, -np.inf, 0.0])
     return replace(state, poses=Pose(positions, state.poses.quaternion))
 
@@ -220,23 +213,22 @@ def _shift(physics: Physics, name: str, by: Float[np.ndarray, "3"]) -> None:
 
 
 def is_calm(physics: Physics, names: tuple[str, ...]) -> bool:
-    """Whether every object is slower than 2 mm/s and 0.02 rad/s."""
+    """Return whether every object is slower than 2 mm/s and 0.02 rad/s."""
     speeds = [physics.speed(name) for name in names]
-    return all(linear < CALM_SPEED_M_S and angular < CALM_TURN_RAD_S for linear, angular in speeds)
+    return all(linear < _CALM_SPEED_M_S and angular < _CALM_TURN_RAD_S for linear, angular in speeds)
 
 
 def random_rest(asset: ObjectAsset, rng: np.random.Generator) -> Float[np.ndarray, "4"]:
-    """A resting orientation by its probability, turned about the vertical at random."""
+    """Draw a resting orientation by its probability, turned about the vertical at random."""
     choice = rng.choice(len(asset.resting.quaternions), p=asset.resting.probabilities)
     turn = quaternion_exp(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))
     return quaternion_multiply(turn, asset.resting.quaternions[choice])
 
 
 def _lay_out(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator) -> bool:
-    # Large objects first: they are the ones that find no place later.
-    order = sorted(assets, key=lambda name: -assets[name].radius_m)
+    """Place all objects apart from each other; return whether there was room."""
     placed: list[str] = []
-    for name in order:
+    for name in sorted(assets, key=lambda name: -assets[name].radius_m):  # large ones find no place later
         quaternion = random_rest(assets[name], rng)
         height = DROP_M - lowest_point(assets[name], quaternion)
         for _ in range(_TRIES_PER_OBJECT):
@@ -251,7 +243,7 @@ def _lay_out(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random
 
 
 def _place_pusher(physics: Physics, names: tuple[str, ...], rng: np.random.Generator) -> bool:
-    """Somewhere in or just around the workspace, clear of everything."""
+    """Put the pusher in or just around the workspace, clear of everything; return whether there was room."""
     half = WORKSPACE_HALF_M + 2 * PUSHER_RADIUS_M
     for _ in range(_TRIES_PER_OBJECT):
         physics.place_pusher(np.array([*rng.uniform(-half, half, 2), PUSHER_CENTRE_Z_M]))
@@ -260,15 +252,12 @@ def _place_pusher(physics: Physics, names: tuple[str, ...], rng: np.random.Gener
     return False
 
 
-# What a simulated tabletop is made of, where that differs from what a method takes for granted.
-
-
 _MAX_FACTOR = 100.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Conditions:
-    """Light, table and contacts of a world; the defaults are those that everything here is made for.
+    """Light, table and contacts of a world; the defaults are those that the methods assume.
 
     Attributes:
         lamp: how strongly, and in which colour, the scene is lit.
@@ -276,7 +265,7 @@ class Conditions:
         friction_factor: on the friction of every object, hence between object and table, and object and pusher; between
             two objects it counts twice.
         mass_factor: on the mass and the moments of inertia of every object.
-        spot: a near lamp in the place of the distant light, whatever is asked of that; None for the distant light.
+        spot: a near lamp in the place of the distant light; None for the distant light.
     """
 
     lamp: Lamp = field(default_factory=Lamp)

@@ -1,4 +1,4 @@
-"""The simulator as a dynamics model: what the best possible predictions would be worth to a planner."""
+"""The simulator as a dynamics model: an upper bound on what predictions can be worth to a planner."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.states import SceneState
@@ -15,7 +16,7 @@ from osfcore.objects.asset import ObjectAsset
 from osfcore.world.physics import SUBSTEPS, Physics, body_model
 from osfcore.world.scenes import is_calm
 
-_SPARE_M = 0.003  # beyond its way, in which the pusher must meet nothing for an action to be skipped
+_SPARE_M = 0.003  # beyond its way: so far the pusher must meet nothing for an action to be skipped
 
 
 class SimulatedPushes:
@@ -38,15 +39,15 @@ class SimulatedPushes:
     def rollout(
         self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: SceneState | None = None
     ) -> Rollouts:
-        """Where K sequences of T actions lead from a state, in which everything is at rest.
+        """Simulate K sequences of T actions from a state in which everything is at rest.
 
         Args:
             state: of exactly these objects, with its pusher.
             actions: velocities of the pusher [m/s].
-            before: plays no part.
+            before: not used.
 
         Raises:
-            InvalidInput: if actions are beyond their limits.
+            InvalidInput: if actions are beyond their limits, or the state has no pusher.
         """
         actions = check_actions(actions)
         futures = [self._follow(state, sequence) for sequence in actions]
@@ -56,7 +57,8 @@ class SimulatedPushes:
     def _follow(
         self, state: SceneState, actions: Float[np.ndarray, "T 3"]
     ) -> tuple[Float[np.ndarray, "T1 N 3"], Float[np.ndarray, "T1 N 4"], Float[np.ndarray, "T1 3"]]:
-        assert state.pusher is not None
+        if state.pusher is None:
+            raise InvalidInput("pusher of the state", "missing", "there")
         for n, name in enumerate(state.names):
             self._physics.place(name, state.poses[n])
         self._physics.place_pusher(state.pusher)
@@ -67,13 +69,12 @@ class SimulatedPushes:
             else:
                 for _ in range(SUBSTEPS):
                     self._physics.step(action)
-                now = [self._physics.pose(name) for name in state.names]
-                poses.append(Pose.stacked(now))
+                poses.append(Pose.stacked(self._physics.pose(name) for name in state.names))
             pusher.append(self._physics.pusher)
         return np.stack([p.position for p in poses]), np.stack([p.quaternion for p in poses]), np.stack(pusher)
 
     def _walks_past(self, names: tuple[str, ...], action: Float[np.ndarray, "3"]) -> bool:
-        """Move the pusher if this moves nothing else; whether it was so."""
+        """Move the pusher alone if it meets nothing on its way; return whether it did."""
         physics = self._physics
         if not is_calm(physics, names):
             return False

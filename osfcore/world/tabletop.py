@@ -1,7 +1,7 @@
 """The simulated tabletop: PyBullet moves the objects, ray tracing (or TinyRenderer) takes the pictures.
 
-One implementation of `control.world_protocol.World`, with what only a simulator can do besides: tell the truth, take
-any view, move things by hand. Several may live in one process. Deterministic: the same seed gives the same bits.
+It implements `osfcore.control.world.World`. Besides, it gives the true state, takes any view and moves objects by hand.
+Several may live in one process. Deterministic: the same seed gives the same bits.
 """
 
 from __future__ import annotations
@@ -53,7 +53,11 @@ class Tabletop:
         request: what `reset` puts on the table.
         renderer: "embree" (exact shadows, anti-aliased) or "tiny" (PyBullet's TinyRenderer, as the paper used).
         executor: takes the views of an observation side by side, if given; threads serve.
-        conditions: lamps and table, of which "tiny" knows nothing, and contacts; the usual ones if None.
+        conditions: lamp and table, which "tiny" leaves out, and contacts; the usual ones if None.
+
+    Attributes:
+        cameras: what `observe` looks through.
+        names: the objects on the table.
 
     Raises:
         UnknownName, MissingAssets, InvalidInput: if the request cannot be met.
@@ -83,14 +87,14 @@ class Tabletop:
         self._meshes: dict[str, TracedMesh] = {}
         self._physics: Physics | None = None
         self._tiny: TinyScene | None = None
-        self._names: tuple[str, ...] = ()
+        self.names: tuple[str, ...] = ()
         self._light = Light(np.array([0.0, 0.0, 1.0]))
         self._steps = 0
 
     # The World protocol
 
     def reset(self, seed: int) -> Observation:
-        """A new random scene at rest; the same for the same seed, request and objects.
+        """Arrange a new random scene at rest and observe it; the same for the same seed, request and objects.
 
         Raises:
             NoRoom: if the objects do not fit side by side.
@@ -99,7 +103,7 @@ class Tabletop:
         return self.observe()
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """One image per camera."""
+        """Take an image with every camera."""
         return self.render(self.cameras, masks=masks)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
@@ -108,7 +112,9 @@ class Tabletop:
         Raises:
             InvalidInput: if the action is outside its limits; the world is unchanged.
         """
-        self.act_contacts(action)
+        velocity = check_action(action)
+        for _ in range(SUBSTEPS):
+            self._advance(velocity)
 
     def close(self) -> None:
         """Free the simulation."""
@@ -122,19 +128,14 @@ class Tabletop:
     # What only a simulator can do
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The objects on the table."""
-        return self._names
-
-    @property
     def assets(self) -> Mapping[str, ObjectAsset]:
         """The objects on the table with their shapes."""
-        return {name: self._asset(name) for name in self._names}
+        return {name: self._asset(name) for name in self.names}
 
     @property
     def models(self) -> Mapping[str, BodyModel]:
-        """What physics knows of the objects on the table."""
-        return {name: self._models[name] for name in self._names}
+        """Masses and collision shapes of the objects on the table."""
+        return {name: self._models[name] for name in self.names}
 
     @property
     def time_s(self) -> float:
@@ -148,15 +149,15 @@ class Tabletop:
         return self._physics
 
     def truth(self) -> SceneState:
-        """The true state, for drawing and evaluation; estimators must not see it."""
+        """Return the true state, for drawing and evaluation; estimators must not see it."""
         light = self._conditions.spot.distant if self._conditions.spot else self._light
-        return SceneState(self._names, self._poses(), light, self._bodies.pusher)
+        return SceneState(self.names, self._poses(), light, self._bodies.pusher)
 
     def _poses(self) -> Pose:
-        return Pose.stacked(self._bodies.pose(name) for name in self._names)
+        return Pose.stacked(self._bodies.pose(name) for name in self.names)
 
     def arrange(self, seed: int) -> None:
-        """Like `reset`, without taking images.
+        """Arrange a scene as `reset` does, without taking images.
 
         Raises:
             NoRoom: if the objects do not fit side by side.
@@ -183,20 +184,20 @@ class Tabletop:
         for name in state.names:
             check_object(self._library, name)
             check_place(name, state.pose(name).position)
-        before = (self._names, self.truth() if self._physics is not None else None)
+        before = None if self._physics is None else self.truth()
         self._place_all(state)
         try:
-            refuse_overlaps(self._bodies, self._names)
+            refuse_overlaps(self._bodies, self.names)
         except OverlappingObjects:
-            if before[1] is not None:
-                self._place_all(before[1])
-            else:
+            if before is None:
                 self.close()
+            else:
+                self._place_all(before)
             raise
         self._steps = 0
 
     def load_measured(self, state: SceneState) -> None:
-        """Like `load` for poses that were measured: what sinks in is lifted, what penetrates is moved apart.
+        """Load measured poses: objects that sink into the table are lifted, those that overlap are moved apart.
 
         Raises:
             UnknownName, MissingAssets, InvalidInput: as `load`.
@@ -205,10 +206,10 @@ class Tabletop:
         for name in state.names:
             check_place(name, state.pose(name).position)
         self.restore(state)
-        move_apart(self._bodies, self._names)
+        move_apart(self._bodies, self.names)
 
     def restore(self, state: SceneState) -> None:
-        """Put back a state that a world has told before.
+        """Put back an earlier true state of a world.
 
         Unlike `load` it does not look for overlaps: contact may have left bodies a little inside each other.
 
@@ -221,25 +222,22 @@ class Tabletop:
         self._steps = 0
 
     def act_steps(self, action: Float[np.ndarray, "3"], rate_hz: float = 60.0) -> Iterator[SceneState]:
-        """Like `act`, telling the state about `rate_hz` times a second of simulated time; the last one is the end.
+        """Act, and yield the state about `rate_hz` times a second of simulated time; the last one is the end.
 
         Raises:
             InvalidInput: if the action is outside its limits; the world is unchanged.
         """
         velocity = check_action(action)
-        stride = max(round(1 / (rate_hz * TIME_STEP_S)), 1)
+        stride = _stride(rate_hz)
         for step in range(1, SUBSTEPS + 1):
             self._advance(velocity)
             if step % stride == 0 or step == SUBSTEPS:
                 yield self.truth()
 
-    def act_contacts(self, action: Float[np.ndarray, "3"]) -> frozenset[str]:
-        """Like `act`; returns the objects that the pusher touched meanwhile."""
-        velocity = check_action(action)
-        return frozenset().union(*(self._advance(velocity) for _ in range(SUBSTEPS)))
-
     def act_recorded(self, action: Float[np.ndarray, "3"], instants: int) -> tuple[frozenset[str], Pose]:
-        """Like `act_contacts`, with the objects' poses (instants, N) on the way, equally spaced, the last at the end.
+        """Act; return the objects touched by the pusher, and all poses (instants, N) on the way.
+
+        The instants are equally spaced; the last one is the end of the action.
 
         Raises:
             InvalidInput: if the action is outside its limits or `instants` no divisor of 48; the world is unchanged.
@@ -256,13 +254,13 @@ class Tabletop:
         return touched, Pose.stacked(poses)
 
     def settle(self, rate_hz: float = 60.0) -> Iterator[SceneState]:
-        """Let everything come to rest, at most 3 s, telling the state on the way."""
-        stride = max(round(1 / (rate_hz * TIME_STEP_S)), 1)
+        """Let everything come to rest within 3 s, and yield the state on the way."""
+        stride = _stride(rate_hz)
         for step in range(1, round(_SETTLE_LIMIT_S / TIME_STEP_S) + 1):
             self._advance(np.zeros(3))
             if step % stride == 0:
                 yield self.truth()
-                if is_calm(self._bodies, self._names):
+                if is_calm(self._bodies, self.names):
                     return
 
     def move_object(self, name: str, pose: Pose) -> None:
@@ -273,8 +271,8 @@ class Tabletop:
             InvalidInput: if the pose is not finite, its quaternion not unit, or it is not over the table.
             OverlappingObjects: if it would penetrate something by more than 2 mm; then nothing moved.
         """
-        if name not in self._names:
-            raise UnknownName("object on the table", name, self._names)
+        if name not in self.names:
+            raise UnknownName("object on the table", name, self.names)
         position = finite_vector(pose.position, 3, f"position of {name} [m]")
         check_place(name, position)
         quaternion = unit_quaternion(pose.quaternion, f"quaternion of {name}")
@@ -282,14 +280,14 @@ class Tabletop:
         before = bodies.pose(name)
         bodies.place(name, Pose(position, quaternion))
         try:
-            refuse_overlaps(bodies, self._names, name)
+            refuse_overlaps(bodies, self.names, name)
         except OverlappingObjects:
             bodies.place(name, before)
             raise
 
     def gap_m(self, name: str) -> float:
-        """From an object to the nearest other one [m]: 0.05 if it is farther away, negative if they penetrate."""
-        others = [other for other in self._names if other != name]
+        """Return the gap to the nearest other object [m]: 0.05 if it is farther away, negative if they penetrate."""
+        others = [other for other in self.names if other != name]
         return min((self._bodies.distance(name, other) for other in others), default=0.05)
 
     def set_light(self, light: Light) -> None:
@@ -297,7 +295,7 @@ class Tabletop:
         self._light = light
 
     def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
-        """Images of the present state from any cameras.
+        """Take images of the present state with any cameras.
 
         Args:
             cameras: of one image size.
@@ -311,24 +309,23 @@ class Tabletop:
         if len({(c.width, c.height) for c in cameras}) != 1:
             raise InvalidInput("image sizes", [(c.width, c.height) for c in cameras], "the same for all cameras")
         pictures = self.pictures(cameras, with_pusher=with_pusher)
-        count = len(self._names)
         return Observation(
             cameras=cameras,
             images=np.stack([picture.rgb for picture in pictures]),
-            names=self._names,
-            masks=np.stack([masks_of(picture, count) for picture in pictures]) if masks else None,
+            names=self.names,
+            masks=np.stack([masks_of(picture, len(self.names)) for picture in pictures]) if masks else None,
             pusher=self._bodies.pusher if with_pusher else None,
             time_s=self.time_s,
         )
 
     def pictures(self, cameras: tuple[Camera, ...], *, with_pusher: bool = True) -> tuple[Picture, ...]:
-        """Images with coverage and depth, for tests and evaluation."""
+        """Take images with coverage and depth, for evaluation."""
         state = self.truth() if with_pusher else replace(self.truth(), pusher=None)
         if self._renderer == "tiny":
             if self._tiny is None:
                 self._tiny = TinyScene(self.assets)
             return self._tiny.render(state, cameras)
-        self._meshes |= {name: TracedMesh(self._asset(name).mesh) for name in self._names if name not in self._meshes}
+        self._meshes |= {name: TracedMesh(self._asset(name).mesh) for name in self.names if name not in self._meshes}
         c = self._conditions
         tracer = RayTracer(self._meshes, lamp=c.lamp, table=c.table, spot=c.spot, executor=self._executor)
         return tracer.render(state, cameras)
@@ -345,9 +342,8 @@ class Tabletop:
     def _load_objects(self, names: tuple[str, ...]) -> None:
         self._models |= {name: body_model(self._asset(name)) for name in names if name not in self._models}
         self.close()
-        models, c = {name: self._models[name] for name in names}, self._conditions
-        self._physics = Physics(models, friction_factor=c.friction_factor, mass_factor=c.mass_factor)
-        self._names = names
+        self.names, c = names, self._conditions
+        self._physics = Physics(self.models, friction_factor=c.friction_factor, mass_factor=c.mass_factor)
 
     def _place_all(self, state: SceneState) -> None:
         self._load_objects(state.names)
@@ -358,7 +354,12 @@ class Tabletop:
         self._light = state.light
 
 
-# Worlds by name, and what each is made from; other packages offer more (`osfcore.plugins`).
+def _stride(rate_hz: float) -> int:
+    """Return how many time steps of physics lie between two states."""
+    return max(round(1 / (rate_hz * TIME_STEP_S)), 1)
+
+
+# Worlds by name; other packages offer more (`osfcore.plugins`).
 
 
 WORLD = PartKind("world", ("reset", "observe", "act", "close", "truth", "render"))
@@ -366,7 +367,7 @@ WORLD = PartKind("world", ("reset", "observe", "act", "close", "truth", "render"
 
 @dataclass(frozen=True, eq=False, slots=True)
 class WorldInputs:
-    """What a world is made from.
+    """Inputs of a factory of worlds.
 
     Attributes:
         library: where the objects' meshes are.
@@ -377,8 +378,6 @@ class WorldInputs:
     request: SceneRequest
 
 
-def _simulated(given: WorldInputs) -> SimulatedWorld:
-    return Tabletop(given.library, request=given.request)
-
-
-WORLDS: Mapping[str, Callable[[WorldInputs], SimulatedWorld]] = {"simulated": _simulated}
+WORLDS: Mapping[str, Callable[[WorldInputs], SimulatedWorld]] = {
+    "simulated": lambda given: Tabletop(given.library, request=given.request)
+}

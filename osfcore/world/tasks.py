@@ -1,4 +1,4 @@
-"""Rearrangement tasks: random scenes, and where some of their objects are to go."""
+"""Rearrangement tasks: random scenes, and goals to which some of their objects shall move."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects, UnknownName
+from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects, UnknownName, check_ranges
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
 from osfcore.geometry.states import SceneState
@@ -21,7 +21,7 @@ from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.scenes import GAP_M, Conditions, SceneRequest
 from osfcore.world.tabletop import Tabletop
 
-# Random scenes by number: each is the same again without the others, to the last bit.
+# Random scenes by number: none depends on the others.
 
 
 HARSH_ELEVATION_DEG = 10.0
@@ -30,7 +30,7 @@ _LAYOUTS = 10  # arrangements that are tried where objects do not fit
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """What chance decided about a scene.
+    """A random choice of a scene's objects and light.
 
     Attributes:
         names: its objects.
@@ -51,15 +51,15 @@ def draw_scene(
     stream: Stream = Stream.SCENE,
     min_elevation_deg: float = HARSH_ELEVATION_DEG,
 ) -> Draw:
-    """One of many random scenes; it does not depend on the others.
+    """Draw one of many random scenes.
 
     Args:
         available: objects to choose from, `count` or more.
         count: objects in the scene.
         seed: of all the scenes.
         number: which of them.
-        stream: that they are drawn from.
-        min_elevation_deg: of their lights.
+        stream: of random numbers that they are drawn from.
+        min_elevation_deg: least elevation of their lights [deg].
     """
     rng = stream_rng(seed, stream, number)
     light = Light.random(rng, min_elevation_deg)
@@ -70,7 +70,7 @@ def draw_scene(
 
 @contextmanager
 def opened(draw: Draw, library: AssetLibrary, conditions: Conditions | None = None) -> Iterator[Tabletop]:
-    """The draw's scene as a world, for as long as it is needed, under the usual conditions or others."""
+    """Open the draw's scene as a world, under the usual conditions or others; close it at the end."""
     world = Tabletop(library, request=SceneRequest(names=draw.names, light=draw.light), conditions=conditions)
     try:
         for attempt in range(_LAYOUTS):
@@ -96,9 +96,9 @@ _RESTS_M, _RESTS_RAD = 0.002, 0.03  # by how much an object may move when it is 
 
 
 def draw_goal(world: Tabletop, count: int, rng: np.random.Generator) -> tuple[SceneState, tuple[str, ...]] | None:
-    """How the table could become with some objects elsewhere, and which; None if there is no room.
+    """Move some objects to free places; return the goal and which moved, or None if there is no room.
 
-    The world is left as the goal is, at rest, or anyhow if there is none.
+    The world is left as the goal is, at rest, or in any state if there is none.
 
     Args:
         world: with the objects where they start from.
@@ -107,13 +107,13 @@ def draw_goal(world: Tabletop, count: int, rng: np.random.Generator) -> tuple[Sc
     """
     start = world.truth()
     moved = tuple(start.names[int(n)] for n in rng.permutation(len(start.names))[:count])
-    if not all(_shifted(world, name, start.pose(name), rng) for name in moved):
+    if not all(_shift(world, name, start.pose(name), rng) for name in moved):
         return None
     return (replace(world.truth(), pusher=None), moved) if came_to_rest(world) else None
 
 
 def came_to_rest(world: Tabletop) -> bool:
-    """Let everything go; whether all objects stayed where they had been put, within 2 mm and 0.03 rad."""
+    """Let everything settle; return whether all objects stayed where they were, within 2 mm and 0.03 rad."""
     asked = world.truth()
     for _ in world.settle():
         pass
@@ -123,24 +123,27 @@ def came_to_rest(world: Tabletop) -> bool:
     return bool(shift.max() <= _RESTS_M and turn.max() <= _RESTS_RAD)
 
 
-def _shifted(world: Tabletop, name: str, pose: Pose, rng: np.random.Generator) -> bool:
-    """Put an object elsewhere in the workspace, beside all others; whether a place was found."""
+def _shift(world: Tabletop, name: str, pose: Pose, rng: np.random.Generator) -> bool:
+    """Shift an object within the workspace; return whether a free place was found."""
     for _ in range(_PLACES):
         angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(*SHIFT_M)
         place = pose.position + np.array([distance * np.cos(angle), distance * np.sin(angle), 0.0])
-        if np.abs(place[:2]).max() > WORKSPACE_HALF_M:
-            continue
-        try:
-            world.move_object(name, Pose(place, pose.quaternion))
-        except (OverlappingObjects, InvalidInput):
-            continue
-        if world.gap_m(name) >= GAP_M:
+        if np.abs(place[:2]).max() <= WORKSPACE_HALF_M and _put(world, name, Pose(place, pose.quaternion)):
             return True
     return False
 
 
+def _put(world: Tabletop, name: str, pose: Pose) -> bool:
+    """Try to put an object somewhere; return whether it is there, clear of all others."""
+    try:
+        world.move_object(name, pose)
+    except (OverlappingObjects, InvalidInput):
+        return False
+    return world.gap_m(name) >= GAP_M
+
+
 def random_goal(world: Tabletop, seed: int, moved: int | None) -> tuple[SceneState, tuple[str, ...]]:
-    """A random layout with some objects elsewhere, and which; the world is left like that.
+    """Draw a random layout with some objects elsewhere; return it and which moved. The world is left like that.
 
     Args:
         world: with the objects where they start from.
@@ -148,12 +151,12 @@ def random_goal(world: Tabletop, seed: int, moved: int | None) -> tuple[SceneSta
         moved: how many objects move; None for a random number.
 
     Raises:
-        InvalidInput: if more shall move than there are, or none.
-        NoRoom: if none has room.
+        InvalidInput: if `moved` is not between 1 and the number of objects.
+        NoRoom: if no layout has room.
     """
     start = world.truth()
-    if moved is not None and not 1 <= moved <= len(start.names):
-        raise InvalidInput("number of objects that move", moved, f"between 1 and {len(start.names)}")
+    if moved is not None:
+        check_ranges(("number of objects that move", moved, 1, len(start.names)))
     for attempt in range(_GOALS):
         rng = stream_rng(seed, Stream.GOAL_LAYOUT, attempt)
         count = int(rng.integers(1, len(start.names) + 1)) if moved is None else moved
@@ -165,7 +168,9 @@ def random_goal(world: Tabletop, seed: int, moved: int | None) -> tuple[SceneSta
 
 
 def arranged_goal(world: Tabletop, poses: Mapping[str, Pose], *, is_measured: bool = False) -> SceneState:
-    """The table at rest with some objects at given poses; the world is left like that, or anyhow if it cannot be.
+    """Put some objects at given poses and let the table settle; return how it rests.
+
+    The world is left like that, or in any state if an error is raised.
 
     Args:
         world: with the objects.
@@ -181,9 +186,8 @@ def arranged_goal(world: Tabletop, poses: Mapping[str, Pose], *, is_measured: bo
     for name in poses:
         if name not in state.names:
             raise UnknownName("object on the table", name, state.names)
-    every = [poses.get(name, state.pose(name)) for name in state.names]
-    stacked = Pose.stacked(every)
-    (world.load_measured if is_measured else world.load)(SceneState(state.names, stacked, state.light, None))
+    stacked = Pose.stacked(poses.get(name, state.pose(name)) for name in state.names)
+    (world.load_measured if is_measured else world.load)(replace(state, poses=stacked, pusher=None))
     for _ in world.settle():
         pass
     rests = world.truth()
@@ -204,11 +208,11 @@ def arranged_goal(world: Tabletop, poses: Mapping[str, Pose], *, is_measured: bo
 #               move), to that of the first one (a swap), or to that of a third one, which takes the first one's place.
 #     relit     the tasks of `shifted`; the goal is photographed under another light.
 #
-# Drawn are: the objects; their resting orientations and places, as `placing` does; a light, uniform over the sky 5
-# deg and more above the table; which objects move, in turn 1, 2 and 3 of them (crowded: 2, 2 and 3); for each a
-# place, uniform in the workspace and at least 7.5 cm from where it lies (the paper's least displacement). Rejected
-# and drawn anew are layouts in which an object finds no place 1 cm clear of all others, and those that do not rest:
-# where an object moves by more than 2 mm or 0.03 rad when it is let go.
+# Each task draws the objects; their resting orientations and places, as `place_randomly` does; a light, uniform
+# over the sky 5 deg and more above the table; which objects move, in turn 1, 2 and 3 of them (crowded: 2, 2 and 3);
+# for each a place, uniform in the workspace and at least 7.5 cm from where it lies (the paper's least displacement).
+# A layout is drawn anew if an object finds no place 1 cm clear of all others, or if it does not rest: an object
+# moves by more than 2 mm or 0.03 rad when it is let go.
 
 
 Family = Literal["shifted", "turned", "crowded", "relit"]
@@ -223,7 +227,7 @@ _TASK_PLACES = 100  # that each object tries
 
 @dataclass(frozen=True, slots=True)
 class TaskSet:
-    """Many tasks, none of which depends on the others.
+    """A set of tasks, none of which depends on the others.
 
     Attributes:
         available: objects to choose from.
@@ -240,7 +244,7 @@ class TaskSet:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DrawnTask:
-    """A task, and what was drawn before it.
+    """A task, and the layouts that were rejected before it.
 
     Attributes:
         task: start and goal.
@@ -260,20 +264,19 @@ def check_tasks(tasks: TaskSet) -> None:
     if tasks.family not in FAMILIES:
         raise InvalidInput("family of tasks", repr(tasks.family), f"one of {', '.join(FAMILIES)}")
     least = 2 if tasks.family == "crowded" else 1
-    if not least <= tasks.objects <= MAX_OBJECTS:
-        raise InvalidInput("objects in a scene", tasks.objects, f"between {least} and {MAX_OBJECTS}")
-    if len(tasks.available) < tasks.objects:
-        available = len(tasks.available)
+    check_ranges(("objects in a scene", tasks.objects, least, MAX_OBJECTS))
+    available = len(tasks.available)
+    if available < tasks.objects:
         raise InvalidInput("number of objects with a field and a mesh", available, f"at least {tasks.objects}")
 
 
 def draw_task(library: AssetLibrary, tasks: TaskSet, number: int) -> DrawnTask:
-    """One of the tasks.
+    """Draw one task of a set.
 
     Args:
         library: meshes of the objects.
-        tasks: which they are.
-        number: which of them, from 0.
+        tasks: the set.
+        number: of the task, from 0.
 
     Raises:
         InvalidInput: as `check_tasks`.
@@ -291,22 +294,20 @@ def draw_task(library: AssetLibrary, tasks: TaskSet, number: int) -> DrawnTask:
             names = tuple(start.names[int(n)] for n in rng.permutation(len(start.names)))
             moved = _lay_out(world, family, names, number, rng)
             if moved is not None and came_to_rest(world):
-                goal = replace(world.truth(), pusher=None, light=_goal_light(tasks, number, start.light))
+                light = start.light
+                if tasks.family == "relit":
+                    lights = stream_rng(tasks.seed, Stream.TASK_GOAL_LIGHT, number)
+                    light = Light.random(lights, MIN_ELEVATION_DEG)
+                goal = replace(world.truth(), pusher=None, light=light)
                 return DrawnTask(RearrangementTask(number, start, goal, moved), dict(rejected))
         rejected["no room" if moved is None else "not at rest"] += 1
     raise NoRoom(draw.names, _TASK_LAYOUTS)
 
 
-def _goal_light(tasks: TaskSet, number: int, light: Light) -> Light:
-    if tasks.family != "relit":
-        return light
-    return Light.random(stream_rng(tasks.seed, Stream.TASK_GOAL_LIGHT, number), MIN_ELEVATION_DEG)
-
-
 def _lay_out(
     world: Tabletop, family: Family, names: tuple[str, ...], number: int, rng: np.random.Generator
 ) -> tuple[str, ...] | None:
-    """Put some objects where the goal has them; which, or None if one finds no place.
+    """Put some objects at their goals; return which, or None if one finds no place.
 
     Args:
         world: with all objects where they start from.
@@ -320,16 +321,18 @@ def _lay_out(
         moved = names[: max(2, kind + 1)]
         return moved if _crowd(world, moved, rng, is_cyclic=kind > 0) else None
     moved = names[: kind + 1]
-    turns = _turns(len(moved), rng) if family == "turned" else np.zeros(len(moved))
+    turns = np.zeros(len(moved))
+    if family == "turned":
+        turns = np.deg2rad(rng.uniform(*TURN_DEG, len(moved))) * rng.choice([-1.0, 1.0], len(moved))
     return moved if all(_move(world, name, turn, rng) for name, turn in zip(moved, turns, strict=True)) else None
 
 
-def _turns(count: int, rng: np.random.Generator) -> np.ndarray:
-    return np.deg2rad(rng.uniform(*TURN_DEG, count)) * rng.choice([-1.0, 1.0], count)
-
-
 def _crowd(world: Tabletop, moved: tuple[str, ...], rng: np.random.Generator, *, is_cyclic: bool) -> bool:
-    """Each object takes the place of the next; the last one that of the first, or a free one. Whether there is room."""
+    """Put each object at the place of the next, the last one at that of the first or a free one.
+
+    Returns:
+        Whether there is room.
+    """
     start = world.truth()
     if not is_cyclic and not _move(world, moved[-1], 0.0, rng):
         return False
@@ -346,17 +349,11 @@ def _crowd(world: Tabletop, moved: tuple[str, ...], rng: np.random.Generator, *,
 
 
 def _move(world: Tabletop, name: str, turn_rad: float, rng: np.random.Generator) -> bool:
-    """Put an object elsewhere in the workspace, clear of all others; whether a place was found."""
+    """Put an object elsewhere in the workspace, turned; return whether a free place was found."""
     pose = world.truth().pose(name)
     quaternion = quaternion_multiply(quaternion_exp(np.array([0.0, 0.0, turn_rad])), pose.quaternion)
     for _ in range(_TASK_PLACES):
         place = np.array([*rng.uniform(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, 2), pose.position[2]])
-        if np.linalg.norm(place - pose.position) < MIN_SHIFT_M:
-            continue
-        try:
-            world.move_object(name, Pose(place, quaternion))
-        except (OverlappingObjects, InvalidInput):
-            continue
-        if world.gap_m(name) >= GAP_M:
+        if np.linalg.norm(place - pose.position) >= MIN_SHIFT_M and _put(world, name, Pose(place, quaternion)):
             return True
     return False

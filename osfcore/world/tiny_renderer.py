@@ -19,7 +19,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.objects.asset import ObjectAsset, TexturedMesh
 from osfcore.world.imaging import BACKGROUND_RADIANCE, TABLE_ALBEDO, Lamp, Picture, pusher_mesh
-from osfcore.world.physics import pybullet
+from osfcore.world.physics import BulletClient, pybullet
 
 _NEAR_M, _FAR_M = 0.05, 5.0
 _LIGHT_DISTANCE_M = 3.0
@@ -34,23 +34,25 @@ class TinyScene:
     """
 
     def __init__(self, assets: Mapping[str, ObjectAsset], *, shadow: bool = True) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
+        self._bullet = BulletClient()
         self._shadow = shadow
-        self._table = self._table_body()
+        half = [TABLE_SIDE_M / 2, TABLE_SIDE_M / 2, 0.01]
+        table = self._bullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=[*TABLE_ALBEDO, 1])
+        self._bullet.createMultiBody(0, -1, table, [0, 0, -half[2]])
         self._pusher = self._textured(pusher_mesh())
         self._bodies = {name: self._textured(asset.mesh) for name, asset in assets.items()}
 
     def close(self) -> None:
         """Free the client."""
-        pybullet.disconnect(physicsClientId=self._client)
+        self._bullet.disconnect()
 
     def render(self, state: SceneState, cameras: tuple[Camera, ...]) -> tuple[Picture, ...]:
-        """Pictures of a state; coverage is 0 or 1, TinyRenderer does not smooth edges."""
+        """Draw a state; coverage is 0 or 1, for TinyRenderer does not smooth edges."""
         for i, name in enumerate(state.names):
             self._place(self._bodies[name], state.poses[i])
-        hidden = Pose(np.array([0.0, 0.0, -100.0]), Pose.identity().quaternion)
-        shown = hidden if state.pusher is None else Pose(state.pusher, hidden.quaternion)
-        self._place(self._pusher, shown)
+        hidden = np.array([0.0, 0.0, -100.0])
+        place = hidden if state.pusher is None else state.pusher
+        self._place(self._pusher, Pose(place, Pose.identity().quaternion))
         uids = [self._bodies[name] for name in state.names]
         if state.pusher is not None:
             uids.append(self._pusher)
@@ -58,7 +60,7 @@ class TinyScene:
 
     def _picture(self, state: SceneState, camera: Camera, uids: list[int]) -> Picture:
         lamp = Lamp()
-        _, _, rgba, depth, segments = pybullet.getCameraImage(
+        _, _, rgba, depth, segments = self._bullet.getCameraImage(
             camera.width,
             camera.height,
             _view_matrix(camera),
@@ -71,7 +73,6 @@ class TinyScene:
             lightSpecularCoeff=0,
             shadow=int(self._shadow),
             renderer=pybullet.ER_TINY_RENDERER,
-            physicsClientId=self._client,
         )
         shape = (camera.height, camera.width)
         rgb = np.reshape(np.asarray(rgba, np.uint8), (*shape, 4))[..., :3].astype(np.float32) / 255
@@ -84,27 +85,16 @@ class TinyScene:
 
     def _place(self, uid: int, pose: Pose) -> None:
         w, x, y, z = pose.quaternion
-        pybullet.resetBasePositionAndOrientation(
-            uid, pose.position.tolist(), [x, y, z, w], physicsClientId=self._client
-        )
-
-    def _table_body(self) -> int:
-        half = [TABLE_SIDE_M / 2, TABLE_SIDE_M / 2, 0.01]
-        shape = pybullet.createVisualShape(
-            pybullet.GEOM_BOX, halfExtents=half, rgbaColor=[*TABLE_ALBEDO, 1], physicsClientId=self._client
-        )
-        return pybullet.createMultiBody(0, -1, shape, [0, 0, -half[2]], physicsClientId=self._client)
+        self._bullet.resetBasePositionAndOrientation(uid, pose.position.tolist(), [x, y, z, w])
 
     def _textured(self, mesh: TexturedMesh) -> int:
-        """A visual body; Bullet takes textured meshes from OBJ files only, read while the files exist."""
+        """Add a visual body; Bullet takes textured meshes from OBJ files only, read while the files exist."""
         with tempfile.TemporaryDirectory() as folder:
             cv2.imwrite(f"{folder}/texture.png", mesh.texture[..., ::-1])
             Path(folder, "mesh.mtl").write_text("newmtl material\nmap_Kd texture.png\n")
             Path(folder, "mesh.obj").write_text(_as_obj(mesh))
-            shape = pybullet.createVisualShape(
-                pybullet.GEOM_MESH, fileName=f"{folder}/mesh.obj", physicsClientId=self._client
-            )
-            return pybullet.createMultiBody(0, -1, shape, [0, 0, -100], physicsClientId=self._client)
+            shape = self._bullet.createVisualShape(pybullet.GEOM_MESH, fileName=f"{folder}/mesh.obj")
+            return self._bullet.createMultiBody(0, -1, shape, [0, 0, -100])
 
 
 def _as_obj(mesh: TexturedMesh) -> str:

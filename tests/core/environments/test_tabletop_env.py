@@ -9,18 +9,16 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.utils.env_checker import check_env
 
-import osfcore.environments  # noqa: F401  registers
-from osfcore.environments import registration, tabletop_env
-from osfcore.environments.registration import ACTIONS, TABLETOP_ID
-from osfcore.errors import InvalidInput, OsfError
-from osfcore.extras import MissingExtra
+from osfcore.environments import ACTIONS, TABLETOP_ID, tabletop_env
+from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.geometry.workspace import STEP_S
 from osfcore.metrics.success import RearrangementTask
 from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 from osfcore.world.tasks import DrawnTask, TaskSet, draw_task
+from tests.support.errors import about
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 STAND = np.zeros(2, np.float32)
@@ -56,7 +54,7 @@ def test_gymnasium_finds_nothing_wrong(made, obs):
         check_env(env.unwrapped)
 
 
-def test_each_kind_of_observation_tells_what_it_says(made):
+def test_each_kind_of_observation_holds_its_parts(made):
     seen = {obs: made(obs=obs, image_side=32).reset(seed=3)[0] for obs in ("poses", "pixels", "both")}
     assert set(seen["poses"]) == {"pusher", "objects", "poses", "goal"}
     assert set(seen["pixels"]) == {"pusher", "pixels", "goal"}
@@ -80,20 +78,23 @@ def test_the_reward_is_the_negative_mean_distance_of_poses(made):
 
 
 def test_a_pusher_that_stands_changes_nothing_until_the_end(made):
-    env = made()
+    env = made(render_mode="rgb_array")
     first, _ = env.reset(seed=2)
-    for number in range(1, ACTIONS + 1):
+    assert env.render().shape == (256, 256, 3)
+    ends = []
+    for _ in range(ACTIONS):
         seen, reward, terminated, truncated, info = env.step(STAND)
-        np.testing.assert_allclose(seen["poses"], first["poses"], atol=2e-3)
-        assert (terminated, truncated, info["success"]) == (False, number == ACTIONS, False)
-        assert reward < 0
+        ends.append(truncated)
+        assert (terminated, info["success"]) == (False, False)
+    assert ends == [False] * (ACTIONS - 1) + [True]
+    np.testing.assert_allclose(seen["poses"], first["poses"], atol=2e-3)
+    assert reward < 0
     assert info["others_mm"] < 2
     assert info["moved_mm"] >= 70
 
 
-@pytest.fixture
-def pushed(library):
-    """A task whose goal is where some pushes lead, and these pushes."""
+def test_an_episode_terminates_when_what_had_to_move_has_arrived(made, library, monkeypatch):
+    """The goal is where some pushes lead."""
     world, actions = Tabletop(library, request=SceneRequest(names=NAMES)), []
     world.arrange(0)
     start = world.truth()
@@ -104,11 +105,6 @@ def pushed(library):
         world.act(np.array([*actions[-1].astype(float), 0.0]))
     task = RearrangementTask(0, start, replace(world.truth(), pusher=None), NAMES[:1])
     world.close()
-    return task, actions
-
-
-def test_an_episode_terminates_when_what_had_to_move_has_arrived(made, pushed, monkeypatch):
-    task, actions = pushed
     monkeypatch.setattr(tabletop_env, "draw_task", lambda *_: DrawnTask(task, {}))
     env = made()
     _, info = env.reset(seed=0)
@@ -121,31 +117,12 @@ def test_an_episode_terminates_when_what_had_to_move_has_arrived(made, pushed, m
     assert results[-1][4]["moved_mm"] == pytest.approx(0, abs=1e-3)
 
 
-def test_the_same_seed_is_the_same_episode_and_another_is_not(made):
-    env = made()
-    first, again, other = (env.reset(seed=seed)[0] for seed in (5, 5, 6))
-    assert data_equivalence(first, again, exact=True)
-    assert np.abs(first["poses"] - other["poses"]).max() > 1e-3
-    unseeded, _ = env.reset()
-    assert np.abs(unseeded["poses"] - other["poses"]).max() > 1e-3
-
-
 def test_a_task_of_an_evaluation_can_be_asked_for(made, library):
     task = draw_task(library, TaskSet(NAMES, "crowded", 2, 4), 1).task
     seen, info = made(family="crowded").reset(options={"task_seed": 4, "task_number": 1})
     assert (info["names"], info["moved"]) == (list(task.start.names), list(task.moved))
     np.testing.assert_array_equal(seen["poses"][:, :3], task.start.poses.position)
     np.testing.assert_array_equal(seen["goal"]["poses"][:, :3], task.goal.poses.position)
-
-
-def test_frames_show_the_pusher_where_it_goes(made):
-    env = made(render_mode="rgb_array")
-    env.reset(seed=0)
-    before = env.render()
-    env.step(np.array([0.2, 0.2], np.float32))
-    assert before.shape == (256, 256, 3)
-    assert before.dtype == np.uint8
-    assert np.abs(before.astype(int) - env.render()).max() > 20
 
 
 @pytest.mark.slow
@@ -180,41 +157,34 @@ def test_the_program_of_the_docs_runs(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("chosen", "words"),
+    ("chosen", "error"),
     [
-        ({"obs": "depth"}, "'depth', but it must be one of poses, pixels, both"),
-        ({"family": "flying"}, "'flying', but it must be one of shifted, turned, crowded, relit"),
-        ({"objects": 3}, "number of objects is 3, but it must be at most 2"),
-        ({"names": ("001_chips_can",)}, "001_chips_can"),
-        ({"image_side": 8}, "between 16 and 1024"),
-        ({"render_mode": "ansi"}, "rgb_array"),
-        ({"data_dir": "nowhere", "names": None}, "osf assets fetch"),
+        ({"obs": "depth"}, InvalidInput),
+        ({"family": "flying"}, InvalidInput),
+        ({"objects": 3}, InvalidInput),
+        ({"names": ("001_chips_can",), "objects": 1}, UnknownName),
+        ({"image_side": 8}, InvalidInput),
+        ({"render_mode": "ansi"}, InvalidInput),
+        ({"data_dir": "nowhere", "names": None}, OsfError),
     ],
 )
-def test_mistakes_are_told_in_a_sentence(made, chosen, words):
+def test_mistakes_are_refused(made, chosen, error):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Gymnasium's own, of an unknown render mode
-        with pytest.raises(OsfError) as error:
+        with pytest.raises(error):
             made(**chosen)
-    assert words in str(error.value)
 
 
 @pytest.mark.wrong_arrays
 def test_actions_and_options_outside_their_bounds_are_refused(made):
     env = made().unwrapped
-    with pytest.raises(OsfError, match="reset the environment first"):
-        env.step(STAND)
+    with pytest.raises(OsfError):
+        env.step(STAND)  # before it is reset
     before, _ = env.reset(seed=0)
     for action in ([0.31, 0], [np.nan, 0], [0.1, 0.1, 0.1]):
         with pytest.raises(InvalidInput):
             env.step(np.array(action))
     seen, *_ = env.step(STAND)
     np.testing.assert_allclose(seen["pusher"], before["pusher"], atol=1e-6)
-    with pytest.raises(InvalidInput, match="task_seed"):
+    with pytest.raises(InvalidInput, check=about("options")):
         env.reset(options={"task_seed": -1, "task_number": 0})
-
-
-def test_without_gymnasium_one_sentence_tells_what_to_install(monkeypatch):
-    monkeypatch.setattr("osfcore.extras.find_spec", lambda _: None)
-    with pytest.raises(MissingExtra, match=r"pip install 'osf-manipulation\[gym\]'"):
-        registration.register()

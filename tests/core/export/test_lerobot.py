@@ -21,66 +21,49 @@ from osfcore.export.lerobot import (
     statistics_of,
     write_dataset,
 )
+from tests.support.errors import about
 
-VALUES = st.floats(-10, 10, width=32)
 BOX, MUG, CAN = "009_gelatin_box", "025_mug", "005_tomato_soup_can"
+rows = arrays(np.float64, st.tuples(st.integers(1, 12), st.just(3)), elements=st.floats(-10, 10, width=32))
 
 
-def rows(least):
-    return arrays(np.float64, st.tuples(st.integers(least, 12), st.just(3)), elements=VALUES)
-
-
-@given(st.lists(rows(1), min_size=1, max_size=4))
-def test_statistics_of_parts_are_those_of_the_whole(parts):
+@given(st.lists(rows, min_size=1, max_size=4))
+def test_statistics_of_parts_are_those_of_the_whole_with_quantiles_in_order(parts):
     together, whole = pooled([statistics_of(part) for part in parts]), statistics_of(np.concatenate(parts))
     for key in ("min", "max", "mean", "std", "count"):
         np.testing.assert_allclose(together[key], whole[key], atol=1e-9)
-
-
-@given(rows(1))
-def test_quantiles_lie_in_order_between_the_extremes(values):
-    found = statistics_of(values)
-    ordered = np.array([found[key] for key in ("min", "q01", "q10", "q50", "q90", "q99", "max")])
+    ordered = np.array([whole[key] for key in ("min", "q01", "q10", "q50", "q90", "q99", "max")])
     assert np.all(np.diff(ordered, axis=0) >= -1e-9)
 
 
 def test_statistics_of_images_are_those_of_their_colours():
-    image = np.broadcast_to(np.array([0, 51, 255], np.uint8), (4, 8, 8, 3))
-    found = image_statistics(image)
+    found = image_statistics(np.broadcast_to(np.array([0, 51, 255], np.uint8), (4, 8, 8, 3)))
     assert found["count"].tolist() == [4]
     np.testing.assert_allclose(found["mean"], np.array([0, 0.2, 1]).reshape(3, 1, 1), atol=1e-12)
     np.testing.assert_allclose(found["std"], np.zeros((3, 1, 1)), atol=1e-12)
 
 
 def test_each_number_of_an_environment_state_has_its_name():
-    told = environment_state(np.arange(14.0).reshape(2, 7), np.arange(100.0, 114).reshape(2, 7))
-    by_name = dict(zip(environment_names(2), told, strict=True))
-    assert by_name["object_0_x"] == 0
-    assert by_name["object_1_qw"] == 10
-    assert by_name["goal_1_qz"] == 113
+    state = environment_state(np.arange(14.0).reshape(2, 7), np.arange(100.0, 114).reshape(2, 7))
+    by_name = dict(zip(environment_names(2), state, strict=True))
+    assert (by_name["object_0_x"], by_name["object_1_qw"], by_name["goal_1_qz"]) == (0, 10, 113)
 
 
 @pytest.mark.parametrize(
-    ("names", "moved", "told"),
+    ("names", "moved", "said"),
     [
         ((BOX,), (BOX,), "Push the gelatin box to its goal."),
         ((BOX, MUG), (MUG,), "Push the mug to its goal and leave the gelatin box where it is."),
-        (
-            (BOX, MUG, CAN),
-            (BOX, MUG),
-            "Push the gelatin box and the mug to their goals and leave the tomato soup can where it is.",
-        ),
         ((BOX, MUG, CAN), (), "Push the gelatin box, the mug and the tomato soup can to where the goal shows them."),
-        ((BOX,), (), "Push the gelatin box to where the goal shows it."),
     ],
 )
-def test_tasks_are_told_in_words(names, moved, told):
-    assert instruction(names, moved) == told
+def test_tasks_are_said_in_words(names, moved, said):
+    assert instruction(names, moved) == said  # a part of the data that policies learn from
 
 
-def episode(count, task="Push it.", **told):
+def episode(count, task="Push it.", **given):
     steps = np.arange(2.0 * count).reshape(count, 2)
-    return LeRobotEpisode(task, 0.001 * steps, 0.01 * steps, **told)
+    return LeRobotEpisode(task, 0.001 * steps, 0.01 * steps, **given)
 
 
 def test_rows_of_all_episodes_are_numbered_on(tmp_path):
@@ -92,18 +75,19 @@ def test_rows_of_all_episodes_are_numbered_on(tmp_path):
     assert table["frame_index"] == [0, 1, 2, 0, 1, 0, 1, 2, 3]
     assert table["task_index"] == [0] * 3 + [1] * 2 + [0] * 4
     np.testing.assert_allclose(table["timestamp"], 0.2 * np.array(table["frame_index"]), atol=1e-6)
-    told = pq.read_table(tmp_path / "set" / "meta" / "episodes").to_pydict()
-    assert list(zip(told["dataset_from_index"], told["dataset_to_index"], strict=True)) == [(0, 3), (3, 5), (5, 9)]
-    assert told["tasks"] == [["Push it."], ["Pull it."], ["Push it."]]
+    episodes = pq.read_table(tmp_path / "set" / "meta" / "episodes").to_pydict()
+    starts_and_ends = zip(episodes["dataset_from_index"], episodes["dataset_to_index"], strict=True)
+    assert list(starts_and_ends) == [(0, 3), (3, 5), (5, 9)]
+    assert episodes["tasks"] == [["Push it."], ["Pull it."], ["Push it."]]
 
 
-def test_it_says_of_itself_what_it_holds(tmp_path):
+def test_its_info_describes_its_columns(tmp_path):
     write_dataset(tmp_path / "set", [episode(3, environment=np.ones((3, 28)))])
     info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
     columns = pq.read_schema(tmp_path / "set" / info["data_path"].format(chunk_index=0, file_index=0)).names
     assert set(info["features"]) == set(columns)
-    assert info["video_path"] is None
     assert (info["codebase_version"], info["fps"], info["splits"]) == ("v3.0", 5, {"train": "0:1"})
+    assert info["video_path"] is None
     for feature in info["features"].values():
         assert feature["names"] is None or [len(feature["names"])] == feature["shape"]
     stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
@@ -111,16 +95,16 @@ def test_it_says_of_itself_what_it_holds(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("episodes", "said"),
+    ("episodes", "subject"),
     [
-        ([], "number of episodes is 0"),
-        ([episode(0)], "number of actions in an episode is 0"),
-        ([episode(2, environment=np.ones((3, 14)))], r"rows of observation\.environment_state is 3, .* 2"),
-        ([episode(2), episode(2, environment=np.ones((2, 14)))], "what episode 1 tells is"),
-        ([episode(2, images={"top": np.zeros((2, 9, 8, 3), np.uint8)})], r"is \(9, 8\), but it must be even"),
+        ([], "number of episodes"),
+        ([episode(0)], "number of actions in an episode"),
+        ([episode(2, environment=np.ones((3, 14)))], "rows of observation.environment_state"),
+        ([episode(2), episode(2, environment=np.ones((2, 14)))], "episode 1"),
+        ([episode(2, images={"top": np.zeros((2, 9, 8, 3), np.uint8)})], "size of images"),
     ],
 )
-def test_what_is_no_data_set_is_refused_and_leaves_nothing(tmp_path, episodes, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_malformed_data_sets_are_refused_and_leave_nothing(tmp_path, episodes, subject):
+    with pytest.raises(InvalidInput, check=about(subject)):
         write_dataset(tmp_path / "set", episodes)
     assert list(tmp_path.iterdir()) == []

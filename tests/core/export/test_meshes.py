@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,15 +14,13 @@ from scipy.spatial import KDTree
 from osfcore.estimation.camera_response import linear_of_srgb
 from osfcore.export.meshes import field_glb, glb, scene_glb
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose, quaternion_exp
+from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.io.scene_file import Scene
-from tests.core.export.test_splats import ALBEDO, HALF, ellipsoid_field
+from tests.support.ellipsoid import ALBEDO, HALF, ellipsoid_normals
 
 MUSTARD, GELATIN = "006_mustard_bottle", "009_gelatin_box"
-CAMERAS = default_cameras(64)
 LIGHT = Light(np.array([1.0, -0.5, 0.8]))
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from glTF's axes to ours
 
@@ -42,45 +41,37 @@ def pose_in(scene, node):
 
 
 @pytest.fixture(scope="module")
-def scene():
-    quaternions = quaternion_exp(np.array([[0, 0, 0.4], [1.2, 0.3, -0.5]]))
-    poses = Pose(np.array([[0.05, -0.1, 0.095], [-0.1, 0.02, 0.05]]), quaternions)
-    return Scene(SceneState((MUSTARD, "solid"), poses, LIGHT, np.array([0.0, 0.1, 0.062])), CAMERAS)
-
-
-@pytest.fixture(scope="module")
-def content(scene, library, one_thread):
-    shapes = {MUSTARD: library.load(MUSTARD).mesh, "solid": ellipsoid_field()}
+def content(scene, shapes, one_thread):
     return scene_glb(scene, shapes, FieldLibrary(None).load_table())
 
 
-def test_everything_stands_where_the_scene_says_with_y_up(scene, content, library):
-    read = read_back(content)
-    assert set(read.geometry) == {"table", "pusher", MUSTARD, "solid"}
+def test_everything_stands_where_the_scene_says_with_y_up_and_its_texture(scene, content, library):
+    read, mesh = read_back(content), library.load(MUSTARD).mesh
+    assert set(read.geometry) == {"table", "pusher", *scene.state.names}
     for name in scene.state.names:
         np.testing.assert_allclose(pose_in(read, name), scene.state.pose(name).matrix(), atol=1e-6)
-    mesh = library.load(MUSTARD).mesh
     np.testing.assert_allclose(read.geometry[MUSTARD].vertices, mesh.vertices, atol=1e-6)
-    np.testing.assert_allclose(read.bounds[:, 1], [0, (scene.state.pose(MUSTARD).apply(mesh.vertices))[:, 2].max()],
-                               atol=2e-3)  # fmt: skip
+    top = scene.state.pose(MUSTARD).apply(mesh.vertices)[:, 2].max()
+    np.testing.assert_allclose(read.bounds[:, 1], [0, top], atol=2e-3)
     np.testing.assert_allclose(read.geometry["table"].extents, [1.2, 1.2, 0], atol=1e-6)
+    image = np.asarray(read.geometry[MUSTARD].visual.material.baseColorTexture, float)
+    assert np.abs(image - mesh.texture).mean() < 4  # of 255; JPEG
 
 
 def test_the_light_is_read_back(content):
-    tree, read = tree_of(content), read_back(content)
+    tree = tree_of(content)
     (sun,) = tree["extensions"]["KHR_lights_punctual"]["lights"]
     assert "KHR_lights_punctual" in tree["extensionsUsed"]
     assert (sun["type"], sun["color"]) == ("directional", [1, 1, 1])
     assert sun["intensity"] / np.pi == pytest.approx(0.75)
     (node,) = (n for n in tree["nodes"] if n.get("extensions") == {"KHR_lights_punctual": {"light": 0}})
     assert node["extras"]["ambient"] == 0.25
-    np.testing.assert_allclose(pose_in(read, node["name"])[:3, 2], LIGHT.direction, atol=1e-6)
+    np.testing.assert_allclose(pose_in(read_back(content), node["name"])[:3, 2], LIGHT.direction, atol=1e-6)
 
 
 @given(st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.2, 1)))
 def test_any_light_has_a_rigid_node_that_shines_away_from_it(position):
-    light = Light(np.array(position))
-    scene = trimesh.Scene()
+    light, scene = Light(np.array(position)), trimesh.Scene()
     scene.add_geometry(trimesh.creation.box((0.1, 0.1, 0.1)), node_name="box")
     matrix = pose_in(read_back(glb(scene, light=light)), "light")
     np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6)
@@ -88,14 +79,13 @@ def test_any_light_has_a_rigid_node_that_shines_away_from_it(position):
     np.testing.assert_allclose(matrix[:3, 2], light.direction, atol=1e-6)
 
 
-def test_cameras_see_points_where_ours_do(content):
+def test_cameras_see_points_where_ours_do(scene, content):
     tree = tree_of(content)
     (root,) = (tree["nodes"][number] for number in tree["scenes"][0]["nodes"])
     np.testing.assert_allclose(np.array(root["matrix"]).reshape(4, 4).T[:3, :3], Z_UP.T, atol=1e-9)
-    hanging = {tree["nodes"][number]["name"] for number in root["children"]}
-    assert {f"camera {camera.name}" for camera in CAMERAS} <= hanging
+    assert {f"camera {c.name}" for c in scene.cameras} <= {tree["nodes"][n]["name"] for n in root["children"]}
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3))
-    for number, camera in enumerate(CAMERAS):
+    for number, camera in enumerate(scene.cameras):
         (node,) = (n for n in tree["nodes"] if n.get("camera") == number)
         matrix = np.array(node["matrix"]).reshape(4, 4).T  # trimesh reads the first camera alone
         local = (points - matrix[:3, 3]) @ matrix[:3, :3]
@@ -107,37 +97,26 @@ def test_cameras_see_points_where_ours_do(content):
         assert tree["cameras"][number]["extras"]["K"] == camera.intrinsics.tolist()
 
 
-def test_the_texture_is_kept(content, library):
-    image = np.asarray(read_back(content).geometry[MUSTARD].visual.material.baseColorTexture, float)
-    texture = library.load(MUSTARD).mesh.texture
-    assert image.shape == texture.shape
-    assert np.abs(image - texture).mean() < 4  # of 255; JPEG
-
-
-def test_the_table_s_texture_lies_as_its_albedo_does(scene):
+def test_the_table_s_texture_lies_as_its_albedo_does():
     table = FieldLibrary(None).load_table()
     albedo = np.zeros_like(table.albedo)
     albedo[-1, 0] = 1  # at x = 0.6, y = -0.6
-    content = scene_glb(Scene(SceneState((), Pose.identity(0), LIGHT, None), ()), {}, type(table)(
-        table.half_side, albedo, table.ambient, table.background, table.w1, table.b1, table.w2, table.b2))  # fmt: skip
-    mesh = read_back(content).geometry["table"]
+    empty = Scene(SceneState((), Pose.identity(0), LIGHT, None), ())
+    mesh = read_back(scene_glb(empty, {}, replace(table, albedo=albedo))).geometry["table"]
     colours = trimesh.visual.color.uv_to_interpolated_color(mesh.visual.uv, mesh.visual.material.baseColorTexture)
     bright = mesh.vertices[np.argmax(colours[:, :3].sum(axis=1))]
     np.testing.assert_allclose(bright, [0.6, -0.6, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("light", [None, LIGHT])
-def test_a_field_s_surface_has_its_colours(light, one_thread):
-    content = field_glb(ellipsoid_field(), "solid", light)
+def test_a_field_s_surface_has_its_colours(light, solid, one_thread):
+    content = field_glb(solid, "solid", light)
     tree, mesh = tree_of(content), read_back(content).geometry["solid"]
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices / HALF, axis=1), 1, atol=0.05)
-    normals = mesh.vertices / HALF**2
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    shade = (
-        np.ones((len(normals), 1)) if light is None else 0.25 + 0.75 * np.maximum(normals @ light.direction, 0)[:, None]
-    )
+    cosine = np.maximum(ellipsoid_normals(mesh.vertices) @ LIGHT.direction, 0)
+    shade = np.ones(len(cosine)) if light is None else 0.25 + 0.75 * cosine
     colours = np.asarray(mesh.visual.vertex_attributes["color"])[:, :3] / 255
-    np.testing.assert_allclose(colours, linear_of_srgb(shade * np.array(ALBEDO)), atol=0.06)
+    np.testing.assert_allclose(colours, linear_of_srgb(shade[:, None] * np.array(ALBEDO)), atol=0.06)
     (material,) = tree["materials"]
     assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
     assert ("KHR_materials_unlit" in material.get("extensions", {})) == (light is not None)

@@ -9,25 +9,15 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.geometry.states import SceneState
-from osfcore.render.reference import render_reference, solid_field
+from osfcore.render.reference import render_reference
+from tests.support.ellipsoid import ALBEDO, HALF, ellipsoid_normals
 
 LIGHT = Light(np.array([0.6, -0.4, 1.0]))
-HALF = np.array([0.03, 0.02, 0.04])
-ALBEDO = (0.8, 0.5, 0.2)
-
-
-def ellipsoid_field():
-    """A matte ellipsoid, whose surface and colours are known."""
-    return solid_field(
-        lambda x: (1 - np.linalg.norm(x / HALF, axis=-1)) * HALF.min(),
-        lambda x: x / HALF**2 / np.maximum(np.linalg.norm(x / HALF**2, axis=-1, keepdims=True), 1e-9),
-        HALF, ALBEDO, voxel=0.002, hidden=4,
-    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def splats(one_thread):
-    return field_splats(ellipsoid_field(), LIGHT)
+def splats(solid, one_thread):
+    return field_splats(solid, LIGHT)
 
 
 @pytest.fixture(scope="module")
@@ -37,17 +27,12 @@ def read(splats, tmp_path_factory):
     return gsply.plyread(path)
 
 
-def test_a_reader_of_splats_finds_the_surface(read):
+def test_discs_lie_in_the_surface_and_cover_it(read):
     np.testing.assert_allclose(np.linalg.norm(read.means / HALF, axis=1), 1, atol=0.05)
     np.testing.assert_allclose(np.abs(read.means).max(axis=0), HALF, atol=0.001)
     assert read.shN.size == 0
-
-
-def test_discs_lie_in_the_surface_and_cover_it(read):
     axes = quaternion_to_matrix(read.quats)
-    normals = read.means / HALF**2
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    assert np.median(np.einsum("ij,ij->i", axes[:, :, 2], normals)) > 0.99
+    assert np.median(np.einsum("ij,ij->i", axes[:, :, 2], ellipsoid_normals(read.means))) > 0.99
     deviations = np.exp(read.scales)
     np.testing.assert_array_less(deviations[:, 2], deviations[:, 0])
     a, b, c = HALF
@@ -57,10 +42,10 @@ def test_discs_lie_in_the_surface_and_cover_it(read):
     assert (1 / (1 + np.exp(-read.opacities)) > 0.9).all()
 
 
-def test_colours_are_those_of_the_rendered_image(read):
+def test_colours_are_those_of_the_rendered_image(read, solid):
     camera = Camera.look_at("0", (0.15, -0.1, 0.2), (0, 0, 0), size=48)
     state = SceneState(("solid",), Pose.identity(1), LIGHT, None)
-    rendered = render_reference({"solid": ellipsoid_field()}, None, state, camera, outputs={"rgb", "depth", "opacity"})
+    rendered = render_reference({"solid": solid}, None, state, camera, outputs={"rgb", "depth", "opacity"})
     pixels = np.floor(camera.project(read.means)).astype(int)
     u, v = pixels.T
     depth = camera.T_world_camera.inverse().apply(read.means)[:, 2]
@@ -71,9 +56,8 @@ def test_colours_are_those_of_the_rendered_image(read):
     assert difference.mean() < 0.02
 
 
-def test_colours_are_lambert_s_under_the_light_that_is_told(splats):
+def test_colours_are_lambert_s_under_the_light_that_the_file_names(splats):
     shade = 0.25 + 0.75 * np.maximum(splats.normals @ LIGHT.direction, 0)
     np.testing.assert_allclose(splats.colours, shade[:, None] * ALBEDO, atol=0.06)
     header = splats_ply(splats).split(b"end_header")[0].decode()
-    x, y, z = LIGHT.direction
-    assert f"Lighting is baked in: light toward ({x:.4f}, {y:.4f}, {z:.4f})" in header
+    assert "({:.4f}, {:.4f}, {:.4f})".format(*LIGHT.direction) in header

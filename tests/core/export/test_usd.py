@@ -8,14 +8,12 @@ from PIL import Image
 from pxr import Ar, Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
 from osfcore.estimation.camera_response import linear_of_srgb
-from osfcore.export.usd.export import field_usd, scene_usdz
+from osfcore.export.usd import field_usd, scene_usdz
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera, default_cameras
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose, quaternion_exp
-from osfcore.geometry.states import SceneState
 from osfcore.io.scene_file import Scene
-from tests.core.export.test_splats import ALBEDO, HALF, ellipsoid_field
+from tests.support.ellipsoid import ALBEDO, HALF, ellipsoid_normals
 
 MUSTARD = "006_mustard_bottle"
 LIGHT = Light(np.array([1.0, -0.5, 0.8]))
@@ -42,17 +40,8 @@ def pose_of(prim):
 
 
 @pytest.fixture(scope="module")
-def scene():
-    quaternions = quaternion_exp(np.array([[0, 0, 0.4], [1.2, 0.3, -0.5], [0, 0, 0]]))
-    poses = Pose(np.array([[0.05, -0.1, 0.095], [-0.1, 0.02, 0.05], [0.1, 0.1, 0.04]]), quaternions)
-    return Scene(SceneState((MUSTARD, "solid 1", "solid_1"), poses, LIGHT, np.array([0.0, 0.1, 0.062])), CAMERAS)
-
-
-@pytest.fixture(scope="module")
-def stage(scene, library, one_thread, tmp_path_factory):
-    solid = ellipsoid_field()
-    shapes = {MUSTARD: library.load(MUSTARD).mesh, "solid 1": solid, "solid_1": solid}
-    content = scene_usdz(scene, shapes, FieldLibrary(None).load_table())
+def stage(scene, shapes, one_thread, tmp_path_factory):
+    content = scene_usdz(Scene(scene.state, CAMERAS), shapes, FieldLibrary(None).load_table())
     return opened(content, tmp_path_factory.mktemp("usd"))
 
 
@@ -61,10 +50,10 @@ def faults(stage):
     return [error.GetErrorAsString() for error in UsdValidation.ValidationContext(validators).Validate(stage)]
 
 
-def test_pixars_checks_find_no_fault(stage, tmp_path, one_thread):
+def test_pixars_checks_find_no_fault(stage, solid, tmp_path, one_thread):
     assert faults(stage) == []
-    assert faults(opened(field_usd(ellipsoid_field(), "solid"), tmp_path)) == []
-    assert faults(opened(field_usd(ellipsoid_field(), "solid", LIGHT, is_packed=False), tmp_path, ".usdc")) == []
+    assert faults(opened(field_usd(solid, "solid"), tmp_path)) == []
+    assert faults(opened(field_usd(solid, "solid", LIGHT, is_packed=False), tmp_path, ".usdc")) == []
 
 
 def test_everything_stands_where_the_scene_says(scene, stage, library):
@@ -121,15 +110,14 @@ def test_the_texture_is_kept_and_stands_upright(stage, library):
 
 
 @pytest.mark.parametrize(("light", "colour"), [(None, "diffuseColor"), (LIGHT, "emissiveColor")])
-def test_a_field_s_surface_has_its_colours(light, colour, tmp_path, one_thread):
-    stage = opened(field_usd(ellipsoid_field(), "006 solid", light, is_packed=False), tmp_path, ".usdc")
+def test_a_field_s_surface_has_its_colours(light, colour, solid, tmp_path, one_thread):
+    stage = opened(field_usd(solid, "006 solid", light, is_packed=False), tmp_path, ".usdc")
     prim = shown_as(stage, "006 solid")
     mesh = UsdGeom.Mesh(prim)
     points = np.array(mesh.GetPointsAttr().Get())
     np.testing.assert_allclose(np.linalg.norm(points / HALF, axis=1), 1, atol=0.05)
-    normals = points / HALF**2
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    shade = np.ones(len(points)) if light is None else 0.25 + 0.75 * np.maximum(normals @ light.direction, 0)
+    cosine = np.maximum(ellipsoid_normals(points) @ LIGHT.direction, 0)
+    shade = np.ones(len(points)) if light is None else 0.25 + 0.75 * cosine
     colours = np.array(mesh.GetDisplayColorPrimvar().Get())
     np.testing.assert_allclose(colours, linear_of_srgb(shade[:, None] * np.array(ALBEDO)), atol=0.06)
     assert source_of(prim, colour).GetInput("varname").Get() == "displayColor"

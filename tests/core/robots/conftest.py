@@ -2,7 +2,7 @@ import contextlib
 
 import pytest
 
-from tests.core.robots.robots import example, serving, simulated
+from tests.support.robots import example, serving, simulated
 
 
 @pytest.fixture(scope="package")

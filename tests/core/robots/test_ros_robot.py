@@ -1,5 +1,3 @@
-"""Ros robot: ros robot, ros transforms."""
-
 import contextlib
 import threading
 
@@ -15,12 +13,10 @@ from osfcore.robots.connect import connect
 from osfcore.robots.guarded_world import GuardedWorld
 from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped, SafetyLimits
 from osfcore.robots.ros_robot import RosNames, RosRobot, TransformTree
-from tests.core.robots.robots import until
-from tests.core.robots.ros_stand_in import CAMERAS, StandIn, transform
 from tests.live import free_port
-
-# Ros robot
-
+from tests.support.errors import about
+from tests.support.robots import until
+from tests.support.ros_robots import CAMERAS, StandIn, transform
 
 FAST = SafetyLimits(top_speed_m_s=0.42)
 LEFT = np.array([-0.3, 0.1, 0.0])
@@ -54,7 +50,7 @@ def test_cameras_are_where_the_transforms_put_them(robot):
 
 
 def test_pictures_and_pusher_come(robot, stand_in):
-    stand_in.place = np.array([0.05, -0.1])
+    stand_in.pusher = np.array([0.05, -0.1, 0.06])
     seen = robot.observe(masks=True)
     np.testing.assert_allclose(seen.images, linear_of_srgb(np.array(100 / 255)), atol=0.01)
     np.testing.assert_allclose(seen.pusher, [0.05, -0.1, 0.06], atol=1e-12)
@@ -78,11 +74,11 @@ def test_velocities_are_sent_in_the_frame_of_the_table_until_they_are_over(robot
     assert set(stand_in.frames) == {"table"}
     assert len(stand_in.twists) >= 3
     np.testing.assert_allclose(stand_in.twists[0], LEFT[:2], atol=1e-12)
-    assert stand_in.place[0] < -0.02
+    assert stand_in.pusher[0] < -0.02
 
 
 def test_nothing_moves_before_it_is_started(robot, stand_in):
-    with pytest.raises(RobotRefused, match="stopped, or not started"):
+    with pytest.raises(RobotRefused):
         robot.act(LEFT)
     assert stand_in.twists == []
 
@@ -92,7 +88,7 @@ def test_nothing_follows_the_zero_of_a_stop_from_another_thread(robot, stand_in)
     guard.observe()
     other = threading.Thread(target=lambda: (until(lambda: stand_in.twists), guard.stop("a key was pressed")))
     other.start()
-    with pytest.raises(RobotStopped, match="a key was pressed"):
+    with pytest.raises(RobotStopped, check=about("a key was pressed")):
         guard.act(LEFT)
     other.join()
     until(lambda: not stand_in.twists[-1].any())
@@ -102,71 +98,64 @@ def test_nothing_follows_the_zero_of_a_stop_from_another_thread(robot, stand_in)
     assert moving == sorted(moving, reverse=True)
 
 
-def test_a_robot_that_is_cut_off_stands_and_that_is_told(robot, stand_in):
+def test_a_robot_that_is_cut_off_stands(robot, stand_in):
     guard = GuardedWorld(robot, FAST)
     guard.observe()
     other = threading.Thread(target=lambda: (until(lambda: stand_in.twists), stand_in.cut()))
     other.start()
-    with pytest.raises(ConnectionLost, match="halts by itself"):
+    with pytest.raises(ConnectionLost):
         guard.act(LEFT)
     other.join()
-    with pytest.raises(RobotStopped, match="does not answer"):
+    with pytest.raises(RobotStopped):
         guard.act(LEFT)
+    with pytest.raises(ConnectionLost):
+        robot.observe()
     until(lambda: not stand_in.velocity.any())
-    assert np.linalg.norm(stand_in.place) < 0.3 * 1.2 * (0.2 + 0.15) + 0.05
+    assert np.linalg.norm(stand_in.pusher[:2]) < 0.3 * 1.2 * (0.2 + 0.15) + 0.05
     guard.close()
 
 
-def test_looking_at_a_robot_that_is_cut_off_is_told(robot, stand_in):
-    stand_in.cut()
-    with pytest.raises(ConnectionLost):
-        robot.observe()
-
-
 @pytest.mark.parametrize(
-    ("topic", "words"), [("/left/camera_info", "nothing on /left/camera_info"), ("/tf_static", "left_optical")]
+    ("topic", "subject"), [("/left/camera_info", "/left/camera_info"), ("/tf_static", "left_optical")]
 )
-def test_what_is_not_published_is_named(stand_in, topic, words):
+def test_what_is_not_published_is_named(stand_in, topic, subject):
     stand_in.silent.add(topic)
-    with pytest.raises((RobotRefused, UnknownName), match=words):
+    with pytest.raises((RobotRefused, UnknownName), check=about(subject)):
         short(stand_in)
 
 
-def test_pictures_that_do_not_come_are_told(stand_in):
+def test_pictures_that_do_not_come_are_named(stand_in):
     with contextlib.closing(short(stand_in)) as robot:
         stand_in.silent.add("/right/image_raw/compressed")
-        with pytest.raises(RobotRefused, match="nothing on /right/image_raw/compressed for 0.4 s"):
+        with pytest.raises(RobotRefused, check=about("/right/image_raw/compressed")):
             robot.observe()
 
 
 @pytest.mark.parametrize("data", ["no base64", "QUJD"])
-def test_pictures_that_are_none_are_told(robot, stand_in, data):
+def test_damaged_pictures_are_refused(robot, stand_in, data):
     stand_in.extra["/left/image_raw/compressed"] = {"data": data}
     with pytest.raises(CorruptFile):
         robot.observe()
 
 
-def test_a_camera_that_is_not_calibrated_is_told(stand_in):
+def test_a_camera_that_is_not_calibrated_is_refused(stand_in):
     info = stand_in.messages()["/left/camera_info"]
     stand_in.extra["/left/camera_info"] = info | {"k": [0.0] * 9}
-    with pytest.raises(InvalidInput, match="K of camera left"):
+    with pytest.raises(InvalidInput, check=about("K of camera left")):
         short(stand_in)
 
 
 @pytest.mark.parametrize(
-    ("query", "words"), [("", "cameras of the robot"), ("?cameras=a&colour=red", "part of a robot's address")]
+    ("query", "subject"), [("", "cameras of the robot"), ("?cameras=a&colour=red", "part of a robot's address")]
 )
-def test_names_of_ros_come_with_the_address(query, words):
-    with pytest.raises((InvalidInput, UnknownName), match=words):
+def test_names_of_ros_come_with_the_address(query, subject):
+    with pytest.raises((InvalidInput, UnknownName), check=about(subject)):
         connect(f"ros://127.0.0.1:9090{query}")
-
-
-def test_nobody_there_is_told():
-    with pytest.raises(ConnectionLost, match="does not answer"):
+    with pytest.raises(ConnectionLost):
         connect(f"ros://127.0.0.1:{free_port()}?cameras=a")
 
 
-# Ros transforms
+# Transforms
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -189,13 +178,10 @@ def test_what_came_last_counts():
     np.testing.assert_allclose(tree.pose("pusher", "table").position, [2, 0, 0], atol=1e-12)
 
 
-def test_frames_that_hang_together_by_nothing_are_told():
+def test_unconnected_frames_and_broken_rotations_are_refused():
     tree = TransformTree([{"transforms": [transform("a", "b", Pose.identity()), transform("b", "a", Pose.identity())]}])
-    with pytest.raises(UnknownName, match="frame that leads to table"):
+    with pytest.raises(UnknownName, check=about("table")):
         tree.pose("a", "table")
-
-
-def test_a_rotation_that_is_none_is_told():
     broken = transform("a", "b", Pose(np.zeros(3), np.array([2.0, 0, 0, 0])))
-    with pytest.raises(InvalidInput, match="rotation of frame b"):
+    with pytest.raises(InvalidInput, check=about("rotation of frame b")):
         TransformTree([{"transforms": [broken]}])

@@ -3,6 +3,7 @@
 import numpy as np
 import trimesh
 
+from osfcore.geometry.cameras import Camera
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, RestingPoses, Symmetry, TexturedMesh
 
 
@@ -21,3 +22,11 @@ def box_asset(name: str, size: tuple[float, float, float], *, mass_kg: float = 0
     info = ObjectInfo(name, name, mass_kg, Symmetry("none"), "CC0-1.0", "tests")
     resting = RestingPoses(np.array([[1.0, 0, 0, 0]]), np.ones(1))
     return ObjectAsset(info, mesh, (np.array(box.vertices),), resting)
+
+
+def table_points(camera: Camera) -> np.ndarray:
+    """Where the rays through pixel centres meet the table [m]."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    directions = camera.ray_directions(np.stack([x, y], axis=-1))
+    origin = camera.T_world_camera.position
+    return origin + directions * (-origin[2] / directions[..., 2:])

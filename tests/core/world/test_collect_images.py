@@ -1,5 +1,4 @@
-"""Collect images: collect images, collect observation."""
-
+import contextlib
 import json
 from pathlib import Path
 
@@ -22,117 +21,105 @@ from osfcore.world.collect_images import (
 )
 from osfcore.world.imaging import TABLE_ALBEDO
 from osfcore.world.tabletop import Tabletop
+from tests.support.errors import about
 
-# Collect images
+MUSTARD = "006_mustard_bottle"
+NAMES = ("003_cracker_box", "009_gelatin_box")
 
 
 @pytest.fixture(scope="module")
 def object_set(library, tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "mustard"
-    steps = list(collect_object(CollectObject("006_mustard_bottle", out, images=100, size=64, seed=3), library))
+    steps = list(collect_object(CollectObject(MUSTARD, out, images=100, size=64, seed=3), library))
     assert steps[-1].done == steps[-1].total == 100
     return out
 
 
-def angles_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.rad2deg(np.arccos(np.clip(a @ b.T, -1, 1)))
+def pixels_of(image) -> np.ndarray:
+    return cv2.imread(str(image.path), cv2.IMREAD_UNCHANGED)
 
 
-def directions(images) -> tuple[np.ndarray, np.ndarray]:
-    views = np.array([i.camera.T_world_camera.position for i in images])
-    return views / np.linalg.norm(views, axis=1, keepdims=True), np.array([i.light_direction for i in images])
-
-
-def test_set_is_in_the_osf_format(object_set):
+def test_set_is_in_the_osf_format_and_its_seed_decides_it(library, object_set, tmp_path):
     for split, count in (("train", 60), ("test", 40)):
         entries = json.loads((object_set / split / "anno.json").read_text())
         assert len(entries) == count
         for entry in entries:
             assert {"filename", "RT", "K", "light_pos", "resolution"} <= set(entry)
-            assert entry["resolution"] == 64
             rotation = np.array(entry["RT"])[:, :3]
             np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
             assert np.linalg.norm(entry["light_pos"]) == pytest.approx(1)
             image = cv2.imread(str(object_set / split / entry["filename"]), cv2.IMREAD_UNCHANGED)
             assert image.shape == (64, 64, 4)
+    again = collect_object(CollectObject(MUSTARD, tmp_path / "again", images=100, size=64, seed=3), library)
+    for _ in range(61):
+        next(again)
+    (partial,) = tmp_path.glob(".again*")
+    for file in ("train/anno.json", "train/0007.png", "test/0000.png"):
+        assert (partial / file).read_bytes() == (object_set / file).read_bytes()
+    again.close()
+    assert not list(tmp_path.iterdir())  # an abandoned set leaves nothing
 
 
 def test_views_and_lights_cover_the_sphere_and_no_test_one_is_a_training_one(object_set):
-    train, test = (directions(read_annotations(object_set, split)) for split in ("train", "test"))
+    def angles_deg(a, b):
+        return np.rad2deg(np.arccos(np.clip(a @ b.T, -1, 1)))
+
     sphere = np.random.default_rng(0).normal(size=(500, 3))
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    for kind in (0, 1):
-        assert angles_deg(test[kind], train[kind]).min() > 0.05
-        assert angles_deg(sphere, train[kind]).min(axis=1).max() < 50
+    train, test = (list(read_annotations(object_set, split)) for split in ("train", "test"))
+    for direction in (lambda i: i.camera.T_world_camera.position, lambda i: i.light_direction):
+        found, others = (np.array([direction(image) for image in images]) for images in (train, test))
+        found, others = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (found, others))
+        assert angles_deg(others, found).min() > 0.05
+        assert angles_deg(sphere, found).min(axis=1).max() < 50
 
 
-def test_object_fills_the_frame_without_touching_its_border(object_set):
-    reach = []
-    for image in read_annotations(object_set, "train"):
-        alpha = cv2.imread(str(image.path), cv2.IMREAD_UNCHANGED)[..., 3] > 0
+def test_object_fills_the_frame_without_touching_its_border_with_straight_alpha(object_set):
+    reach, train = [], list(read_annotations(object_set, "train"))
+    for image in train:
+        alpha = pixels_of(image)[..., 3] > 0
         y, x = np.nonzero(alpha)
         reach.append(np.hypot(x + 0.5 - 32, y + 0.5 - 32).max() / 32)
-        assert not alpha[0].any()
-        assert not alpha[-1].any()
+        assert not alpha[[0, -1]].any()
     assert 0.8 < max(reach) <= 0.89  # the bounding sphere spans 87 %
-
-
-def test_alpha_is_straight_and_edges_are_smooth(object_set):
-    image = next(iter(read_annotations(object_set, "train")))
-    rgba = cv2.imread(str(image.path), cv2.IMREAD_UNCHANGED).astype(float)
+    rgba = pixels_of(train[0]).astype(float)
     partial = (rgba[..., 3] > 0) & (rgba[..., 3] < 255)
     assert partial.sum() > 20
     inside = rgba[rgba[..., 3] == 255][:, :3].mean()
     assert rgba[partial][:, :3].mean() > 0.4 * inside  # not darkened by the background
 
 
-def test_same_seed_same_set(library, object_set, tmp_path):
-    again = tmp_path / "again"
-    list(collect_object(CollectObject("006_mustard_bottle", again, images=100, size=64, seed=3), library))
-    assert (again / "test" / "anno.json").read_text() == (object_set / "test" / "anno.json").read_text()
-    assert (again / "train" / "0007.png").read_bytes() == (object_set / "train" / "0007.png").read_bytes()
-
-
-def test_table_set_shows_lambert_radiance(tmp_path):
-    out = tmp_path / "table"
-    list(collect_table(CollectTable(out, images=60, size=32)))
+def test_table_set_shows_lambert_radiance(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    list(collect_table(CollectTable(Path("."), images=60, size=32)))  # an empty folder will do
     elevations = []
-    for image in read_annotations(out, "test"):
-        rgb = cv2.imread(str(image.path), cv2.IMREAD_UNCHANGED)[..., 2::-1] / 255
+    for image in read_annotations(tmp_path / "here", "test"):
         expected = np.array(TABLE_ALBEDO) * (0.25 + 0.75 * image.light_direction[2])
         x, y = np.floor(image.camera.project(np.array([0.0, 0.0, 0.0]))).astype(int)
-        np.testing.assert_allclose(rgb[y, x], expected, atol=1 / 255)
+        np.testing.assert_allclose(pixels_of(image)[y, x, 2::-1] / 255, expected, atol=1 / 255)
         elevations.append(np.rad2deg(np.arcsin(image.light_direction[2])))
     assert min(elevations) < 15
     assert max(elevations) > 60
 
 
-@pytest.mark.parametrize(("images", "size"), [(59, 64), (6000, 64), (100, 15), (100, 2000)])
-def test_numbers_out_of_range_are_refused(library, tmp_path, images, size):
-    with pytest.raises(InvalidInput):
-        list(collect_object(CollectObject("006_mustard_bottle", tmp_path / "out", images, size), library))
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({"images": 59}, InvalidInput),
+        ({"images": 6000}, InvalidInput),
+        ({"size": 15}, InvalidInput),
+        ({"size": 2000}, InvalidInput),
+        ({"seed": -1}, InvalidInput),
+        ({"name": "teapot"}, UnknownName),
+        ({"name": "024_bowl"}, MissingAssets),
+        ({"out": Path("/proc/sets/object")}, CannotWrite),
+    ],
+)
+def test_impossible_sets_are_refused_and_leave_nothing(library, tmp_path, changes, error):
+    with pytest.raises(error):
+        list(collect_object(CollectObject(**{"name": MUSTARD, "out": tmp_path / "out", **changes}), library))
     assert not list(tmp_path.iterdir())
-
-
-def test_unknown_and_missing_objects_are_told(library, tmp_path):
-    with pytest.raises(UnknownName):
-        list(collect_object(CollectObject("teapot", tmp_path / "out"), library))
-    with pytest.raises(MissingAssets):
-        list(collect_object(CollectObject("024_bowl", tmp_path / "out"), library))
-
-
-def test_a_negative_seed_and_an_unwritable_place_are_told(tmp_path):
-    with pytest.raises(InvalidInput, match="seed"):
-        list(collect_table(CollectTable(tmp_path / "out", seed=-1)))
-    with pytest.raises(CannotWrite, match="/proc/sets"):
-        list(collect_table(CollectTable(Path("/proc/sets/table"))))
-
-
-def test_the_current_folder_will_do_if_it_is_empty(tmp_path, monkeypatch):
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    list(collect_table(CollectTable(Path("."), images=60, size=16)))
-    assert (tmp_path / "here" / "test" / "anno.json").exists()
 
 
 def test_two_collections_into_one_folder_do_not_destroy_each_other(tmp_path):
@@ -145,27 +132,14 @@ def test_two_collections_into_one_folder_do_not_destroy_each_other(tmp_path):
         list(second)
     assert len(read_annotations(tmp_path / "table", "test")) == 40
     assert [path.name for path in tmp_path.iterdir()] == ["table"]
+    with pytest.raises(InvalidInput, check=about("output folder")):
+        list(collect_table(config))
 
 
-def test_full_folder_is_left_alone_and_an_abandoned_set_leaves_nothing(library, tmp_path):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "file").write_text("precious")
-    with pytest.raises(InvalidInput, match="new or empty"):
-        list(collect_object(CollectObject("006_mustard_bottle", tmp_path / "mine"), library))
-    steps = collect_object(CollectObject("006_mustard_bottle", tmp_path / "out", 100, 32), library)
-    for _ in range(3):
-        next(steps)
-    steps.close()
-    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+# Observations
 
 
-# Collect observation
-
-
-NAMES = ("003_cracker_box", "009_gelatin_box")
-
-
-def test_what_is_written_is_what_the_cameras_see_of_the_truth(library, tmp_path):
+def test_observation_shows_the_truth(library, tmp_path):
     made = collect_observation(CollectObservation(tmp_path / "scene", NAMES, seed=4, size=32), library)
     read = read_observation(tmp_path / "scene")
     assert read.names == NAMES
@@ -174,10 +148,9 @@ def test_what_is_written_is_what_the_cameras_see_of_the_truth(library, tmp_path)
     assert read.masks.any(axis=(2, 3)).all()
     truth = read_scene(tmp_path / "scene" / TRUTH_FILE)
     np.testing.assert_allclose(truth.state.pusher, read.pusher, atol=1e-12)
-    world = Tabletop(library)
-    world.restore(truth.state)
-    again = world.render(truth.cameras).images
-    world.close()
+    with contextlib.closing(Tabletop(library)) as world:
+        world.restore(truth.state)
+        again = world.render(truth.cameras).images
     assert np.abs(again - read.images).max() <= 0.5 / 255 + 1e-3
 
 
@@ -191,31 +164,30 @@ def test_a_goal_is_one_view_without_pusher_and_masks(library, tmp_path):
 
 def test_a_random_choice_depends_on_the_seed_alone_and_is_among_the_known(library, tmp_path):
     known = (*NAMES, "005_tomato_soup_can", "spoon")
-    chosen = set()
-    for number, seed in enumerate((0, 0, 1, 2, 3)):
-        config = CollectObservation(tmp_path / str(number), objects=2, seed=seed, size=16)
-        chosen.add(collect_observation(config, library, known).names)
-        assert set().union(*chosen) < set(known)
-    first, second = (read_observation(tmp_path / name) for name in "01")
-    np.testing.assert_array_equal(first.images, second.images)
+    made = [
+        collect_observation(CollectObservation(tmp_path / str(n), objects=2, seed=seed, size=16), library, known)
+        for n, seed in enumerate((0, 0, 1, 2, 3))
+    ]
+    chosen = {observation.names for observation in made}
+    assert set().union(*chosen) < set(known)
     assert len(chosen) > 1
+    np.testing.assert_array_equal(made[0].images, made[1].images)
 
 
-def test_mistakes_are_told_and_leave_nothing(library, tmp_path):
-    for changes, kind, words in (
+def test_impossible_observations_are_refused_and_leave_nothing(library, tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").write_text("precious")
+    for changes, kind, subject in (
         ({"names": ("teapot",)}, UnknownName, "teapot"),
         ({"names": ("024_bowl",)}, MissingAssets, "024_bowl"),
-        ({"objects": 3}, InvalidInput, "between 1 and 2"),
-        ({"objects": 0}, InvalidInput, "between 1 and 2"),
+        ({"names": None, "objects": 3}, InvalidInput, "number of objects"),
+        ({"names": None, "objects": 0}, InvalidInput, "number of objects"),
         ({"size": 5}, InvalidInput, "image size"),
         ({"seed": -1}, InvalidInput, "seed"),
+        ({"out": tmp_path / "full"}, InvalidInput, "output folder"),
+        ({"out": tmp_path / "full" / "file" / "new"}, CannotWrite, "full"),
     ):
-        with pytest.raises(kind, match=words):
-            collect_observation(CollectObservation(**{"out": tmp_path / "new", **changes}), library, NAMES)
-    assert list(tmp_path.iterdir()) == []
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "file").write_text("")
-    with pytest.raises(InvalidInput, match="new or empty"):
-        collect_observation(CollectObservation(tmp_path / "full", NAMES), library)
-    with pytest.raises(CannotWrite):
-        collect_observation(CollectObservation(tmp_path / "full" / "file" / "new", NAMES), library)
+        config = CollectObservation(**{"out": tmp_path / "new", "names": NAMES, **changes})
+        with pytest.raises(kind, check=about(subject)):
+            collect_observation(config, library, NAMES)
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["full", "full/file"]

@@ -11,8 +11,8 @@ from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import Quality, SceneBatch
 from osfcore.world.imaging import TABLE_ALBEDO, Lamp, RayTracer, TableSurface, TracedMesh, masks_of, wooden_texture
-from tests.core.render.scenes import block, table_of
-from tests.core.world.boxes import box_asset
+from tests.core.world.boxes import box_asset, table_points
+from tests.support.rendered_scenes import block, table_of
 
 HALF = np.array([0.03, 0.02, 0.05])
 BOX = TracedMesh(box_asset("box", tuple(2 * HALF)).mesh)
@@ -32,14 +32,6 @@ def traced(state: SceneState, camera: Camera, spot: SpotLamp | None, **given):
     return RayTracer(dict.fromkeys(state.names, BOX), spot=spot, **given).render(state, (camera,))[0]
 
 
-def seen_points(camera: Camera) -> np.ndarray:
-    """Where the rays through pixel centres meet the table [m]."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    directions = camera.ray_directions(np.stack([x, y], axis=-1))
-    origin = camera.T_world_camera.position
-    return origin + directions * (-origin[2] / directions[..., 2:])
-
-
 def open_irradiance(points: np.ndarray, spot: SpotLamp) -> np.ndarray:
     return 0.25 + 0.75 * spot.toward(points)[..., 2] * spot.falloff(points) * spot.spot_factor(points)
 
@@ -52,10 +44,10 @@ def shaded_by_box(points: np.ndarray, spot: SpotLamp, centre: np.ndarray) -> np.
     return np.maximum(enter.max(axis=-1), 0) < np.minimum(leave.min(axis=-1), 1)
 
 
-@pytest.mark.parametrize("spot", [SPOT, BARE, SpotLamp(np.array([0, 0, 0.3]), np.array([0.1, 0.0, 0]), 15, 15)])
-@pytest.mark.parametrize("camera", [ABOVE, goal_camera(256)])
+@pytest.mark.parametrize("spot", [BARE, SpotLamp(np.array([0, 0, 0.3]), np.array([0.1, 0.0, 0]), 15, 15)])
+@pytest.mark.parametrize("camera", [ABOVE, goal_camera(128)])
 def test_the_empty_table_falls_off_and_has_the_cones_edge(spot, camera):
-    picture, points = traced(boxes(), camera, spot), seen_points(camera)
+    picture, points = traced(boxes(), camera, spot), table_points(camera)
     expected = np.array(TABLE_ALBEDO) * open_irradiance(points, spot)[..., None]
     corners = [open_irradiance(points + [dx, dy, 0], spot) for dx in (-0.004, 0.004) for dy in (-0.004, 0.004)]
     smooth = (np.max(corners, axis=0) - np.min(corners, axis=0) < 0.1) & (np.abs(points[..., :2]).max(axis=-1) < 0.59)
@@ -63,10 +55,10 @@ def test_the_empty_table_falls_off_and_has_the_cones_edge(spot, camera):
     np.testing.assert_allclose(picture.rgb[smooth], expected[smooth], atol=2e-3)
 
 
-@pytest.mark.parametrize("lamp", [(0.2, 0.1, 0.35), (-0.1, 0.25, 0.2), (-0.25, -0.1, 0.5)])
+@pytest.mark.parametrize("lamp", [(-0.1, 0.25, 0.2), (-0.25, -0.1, 0.5)])
 def test_the_shadow_of_a_box_is_its_perspective_projection(lamp):
     spot, centre = SpotLamp(np.array(lamp), np.zeros(3), 80, 90), np.array([0.01, 0.0, 0.05])
-    picture, points = traced(boxes(centre), ABOVE, spot), seen_points(ABOVE)
+    picture, points = traced(boxes(centre), ABOVE, spot), table_points(ABOVE)
     on_table = picture.coverage[0] == 0
     dark = shaded_by_box(points, spot, centre)
     bright = TABLE_ALBEDO[0] * open_irradiance(points, spot)
@@ -85,16 +77,6 @@ def test_what_lies_beyond_the_lamp_casts_no_shadow():
     assert between.rgb[40, 32, 0] < 0.3 * empty.rgb[40, 32, 0]
 
 
-def test_faces_are_as_bright_as_their_points_see_the_lamp():
-    centre = np.array([0.0, 0.0, 0.05])
-    picture, normal = traced(boxes(centre), ABOVE, SPOT), np.array([0, 0, 1.0])
-    for place in ((0.0, 0.0), (0.015, 0.01), (-0.015, -0.005)):
-        point = Pose(centre, TURN).apply(np.array([*place, 0.05]))
-        x, y = np.floor(ABOVE.project(point[None])[0]).astype(int)
-        gain = SPOT.falloff(point) * SPOT.spot_factor(point) * (SPOT.toward(point) @ normal)
-        np.testing.assert_allclose(picture.rgb[y, x], 204 / 255 * (0.25 + 0.75 * gain), rtol=0.01)
-
-
 def test_a_lamp_200_m_away_is_the_distant_light():
     light = np.array([0.4, -0.3, 0.5])
     state = boxes((0.03, 0, 0.05), (-0.06, 0.05, 0.05), pusher=np.array([0, -0.1, PUSHER_CENTRE_Z_M]), light=light)
@@ -109,18 +91,16 @@ def test_a_lamp_200_m_away_is_the_distant_light():
 def test_a_lamp_shines_on_wood_in_the_colour_of_its_strength():
     wood, lamp = TableSurface(texture=wooden_texture(np.random.default_rng(0), 512)), Lamp(0.1, 0.8, 1.2, (1, 0.9, 0.8))
     state = boxes((0.03, 0, 0.05))
-    default, exact = (
-        traced(state, goal_camera(96), SPOT, lamp=lamp, table=wood),
-        RayTracer({"box 0": BOX}, spot=SPOT, lamp=lamp, table=wood).render(
-            state, (goal_camera(96),), samples=8, sharp=True
-        )[0],
+    tracer = RayTracer({"box 0": BOX}, spot=SPOT, lamp=lamp, table=wood)
+    (default,), (exact,) = (
+        tracer.render(state, (goal_camera(48),), **how) for how in ({}, dict(samples=8, sharp=True))
     )
     assert -10 * np.log10(np.mean((default.rgb - exact.rgb) ** 2)) > 36
 
 
-@pytest.mark.parametrize("lamp", [(0.3, 0.1, 0.45), (-0.2, 0.25, 0.3), (0.25, 0.2, 0.6)])
+@pytest.mark.parametrize("lamp", [(0.3, 0.1, 0.45), (-0.2, 0.25, 0.3)])
 def test_the_field_renderer_draws_the_shadows_that_rays_draw(lamp):
-    """Boxes as fields and as meshes, seen from the goal camera."""
+    """The same boxes as fields and as meshes."""
     spot = SpotLamp(np.array(lamp), np.zeros(3), 60, 75)
     places = [(0.05, 0.02, 0.05), (-0.06, -0.03, 0.05)]
     state, camera = boxes(*places), goal_camera(128)

@@ -12,31 +12,34 @@ LEVEL = np.array([1.0, 0, 0, 0])
 
 
 @pytest.fixture
-def physics():
-    simulation = Physics({"box": body_model(BOX)})
-    yield simulation
-    simulation.close()
+def simulated():
+    """Makes simulations of boxes, and closes them."""
+    made = []
+
+    def make(*names, model=None, **factors):
+        made.append(Physics({name: model or body_model(BOX) for name in names or ("box",)}, **factors))
+        return made[-1]
+
+    yield make
+    for physics in made:
+        physics.close()
+        physics.close()  # again does nothing
 
 
-def test_mass_properties_of_a_turned_box_are_the_closed_form():
+def test_mass_properties_of_a_turned_box_are_the_closed_form_and_parts_add_up():
     a, b, c = 0.08, 0.06, 0.04
     turned = Pose(np.array([0.01, -0.02, 0.03]), quaternion_exp(np.array([0.3, 0.5, -0.2])))
-    frame, moments = mass_properties((turned.apply(BOX.parts[0]),), 0.3)
-    np.testing.assert_allclose(frame.position, turned.position, atol=1e-9)
-    expected = 0.3 / 12 * np.array([b * b + c * c, a * a + c * c, a * a + b * b])
-    np.testing.assert_allclose(moments, expected, rtol=1e-6)
-
-
-def test_parts_add_up_to_the_whole():
     halves = [BOX.parts[0].copy(), BOX.parts[0].copy()]
-    halves[0][:, 0] = np.maximum(halves[0][:, 0], 0)
-    halves[1][:, 0] = np.minimum(halves[1][:, 0], 0)
-    whole, split = mass_properties(BOX.parts, 0.3), mass_properties(tuple(halves), 0.3)
-    np.testing.assert_allclose(split[0].position, whole[0].position, atol=1e-9)
-    np.testing.assert_allclose(split[1], whole[1], rtol=1e-6)
+    halves[0][:, 0], halves[1][:, 0] = np.maximum(halves[0][:, 0], 0), np.minimum(halves[1][:, 0], 0)
+    for parts in (BOX.parts, halves):
+        frame, moments = mass_properties(tuple(turned.apply(part) for part in parts), 0.3)
+        np.testing.assert_allclose(frame.position, turned.position, atol=1e-9)
+        expected = 0.3 / 12 * np.array([b * b + c * c, a * a + c * c, a * a + b * b])
+        np.testing.assert_allclose(moments, expected, rtol=1e-6)
 
 
-def test_box_rests_on_the_table_without_sinking_or_jitter(physics):
+def test_box_rests_on_the_table_without_sinking_or_jitter(simulated):
+    physics = simulated()
     physics.place("box", Pose(np.array([0.0, 0, 0.021]), LEVEL))
     settle(physics, ("box",))
     before = physics.pose("box")
@@ -48,14 +51,12 @@ def test_box_rests_on_the_table_without_sinking_or_jitter(physics):
     np.testing.assert_allclose(after.position, before.position, atol=1e-4)
 
 
-def test_pose_is_of_the_object_frame_not_of_the_centre_of_mass():
-    lopsided = box_asset("box", (0.08, 0.06, 0.04))
-    shifted = type(lopsided)(lopsided.info, lopsided.mesh, (lopsided.parts[0] + [0.01, 0.005, 0],), lopsided.resting)
-    simulation = Physics({"box": body_model(shifted)})
+def test_pose_is_of_the_object_frame_not_of_the_centre_of_mass(simulated):
+    shifted = type(BOX)(BOX.info, BOX.mesh, (BOX.parts[0] + [0.01, 0.005, 0],), BOX.resting)
     pose = Pose(np.array([0.1, 0.05, 0.2]), quaternion_exp(np.array([0.1, 0.2, 0.3])))
-    simulation.place("box", pose)
-    np.testing.assert_allclose(simulation.pose("box").matrix(), pose.matrix(), atol=1e-6)
-    simulation.close()
+    physics = simulated(model=body_model(shifted))
+    physics.place("box", pose)
+    np.testing.assert_allclose(physics.pose("box").matrix(), pose.matrix(), atol=1e-6)
 
 
 def pushed_and_let_go(physics: Physics) -> tuple[float, float]:
@@ -71,36 +72,20 @@ def pushed_and_let_go(physics: Physics) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(("friction", "mass"), [(1, 1), (0.5, 1), (2, 1), (1, 0.5), (1, 2)])
-def test_sliding_box_stops_by_coulomb_friction_whatever_its_mass(friction, mass):
+def test_sliding_box_stops_by_coulomb_friction_whatever_its_mass(simulated, friction, mass):
     """v^2 / (2 mu g) with mu = 0.5 * 1.0 and a factor: from 0.3 m/s, 9.2 mm with the factor 1."""
-    simulation = Physics({"box": body_model(BOX)}, friction_factor=friction, mass_factor=mass)
-    slid = pushed_and_let_go(simulation)[1]
-    simulation.close()
+    slid = pushed_and_let_go(simulated(friction_factor=friction, mass_factor=mass))[1]
     assert slid == pytest.approx(0.3**2 / (2 * friction * 0.5 * 9.81), rel=0.1)
 
 
-def test_a_box_heavier_than_the_pusher_yields_more_slowly():
+def test_a_box_heavier_than_the_pusher_yields_more_slowly(simulated):
     """Three times its mass: no object is, but only then does a mass show where everything is pushed."""
-    ends = []
-    for mass in (1, 1000):
-        simulation = Physics({"box": body_model(BOX)}, mass_factor=mass)
-        ends.append(pushed_and_let_go(simulation)[0])
-        simulation.close()
-    assert 0.002 < ends[0] - ends[1] < 0.02
+    light, heavy = (pushed_and_let_go(simulated(mass_factor=mass))[0] for mass in (1, 1000))
+    assert 0.002 < light - heavy < 0.02
 
 
-def test_a_box_in_the_air_goes_on_as_it_was_thrown(physics):
-    physics.place("box", Pose(np.array([0.0, 0, 0.5]), LEVEL))
-    physics.place_pusher(np.array([0.3, 0.3, PUSHER_CENTRE_Z_M]))
-    physics.set_velocity("box", np.array([0.2, -0.1, 0]), np.array([0, 0, 2.0]))
-    for _ in range(24):
-        physics.step(np.zeros(3))
-    pose = physics.pose("box")
-    np.testing.assert_allclose(pose.position[:2], [0.02, -0.01], atol=1e-5)
-    np.testing.assert_allclose(pose.quaternion, quaternion_exp(np.array([0, 0, 0.2])), atol=1e-4)
-
-
-def test_pusher_follows_its_velocity_exactly_and_pushes_what_it_meets(physics):
+def test_pusher_follows_its_velocity_exactly_and_pushes_what_it_meets(simulated):
+    physics = simulated()
     physics.place("box", Pose(np.array([0.0, 0, 0.02]), LEVEL))
     start = np.array([-0.1, 0.0, PUSHER_CENTRE_Z_M])
     physics.place_pusher(start)
@@ -108,41 +93,29 @@ def test_pusher_follows_its_velocity_exactly_and_pushes_what_it_meets(physics):
     np.testing.assert_allclose(physics.pusher, start + [0.06, 0.02, 0], atol=1e-12)
     assert frozenset(["box"]) in touched
     assert frozenset() == touched[0]
-    gap = physics.distance("box", None)
-    assert -0.001 < gap < 0.01
+    assert -0.001 < physics.distance("box", None) < 0.01
     assert physics.pose("box").position[0] > 0.01
 
 
-def test_pusher_stops_at_its_reach(physics):
+def test_pusher_stops_at_its_reach(simulated):
+    physics = simulated()
     physics.place_pusher(np.array([PUSHER_REACH_M - 0.01, 0, PUSHER_CENTRE_Z_M]))
     for _ in range(SUBSTEPS):
         physics.step(np.array([0.3, 0.3, 0]))
     np.testing.assert_allclose(physics.pusher[:2], [PUSHER_REACH_M, 0.3 * SUBSTEPS * TIME_STEP_S], atol=1e-9)
 
 
-def test_gap_between_boxes_is_the_true_one():
-    simulation = Physics({"a": body_model(BOX), "b": body_model(BOX)})
-    simulation.place("a", Pose(np.array([0.0, 0, 0.02]), LEVEL))
-    simulation.place("b", Pose(np.array([0.09, 0, 0.02]), LEVEL))
-    assert simulation.distance("a", "b") == pytest.approx(0.01, abs=5e-4)
-    simulation.place("b", Pose(np.array([0.07, 0, 0.02]), LEVEL))
-    assert simulation.distance("a", "b") == pytest.approx(-0.01, abs=5e-4)
-    simulation.close()
-
-
-def test_reset_forgets_everything(physics):
-    def episode() -> np.ndarray:
-        physics.reset()
-        physics.place("box", Pose(np.array([0.0, 0, 0.02]), LEVEL))
-        physics.place_pusher(np.array([-0.07, 0.01, PUSHER_CENTRE_Z_M]))
-        for _ in range(100):
-            physics.step(np.array([0.2, 0.05, 0]))
-        return physics.pose("box").matrix()
-
-    np.testing.assert_array_equal(episode(), episode())
+def test_gap_between_boxes_is_the_true_one_and_separation_the_way_out(simulated):
+    physics = simulated("a", "b")
+    physics.place("a", Pose(np.array([0.0, 0, 0.02]), LEVEL))
+    for x, gap in ((0.09, 0.01), (0.07, -0.01), (0.3, 0.05)):
+        physics.place("b", Pose(np.array([x, 0, 0.02]), LEVEL))
+        assert physics.distance("a", "b") == pytest.approx(gap, abs=5e-4)
+        found, away = physics.separation("b", "a")
+        assert found == pytest.approx(gap, abs=5e-4)
+        np.testing.assert_allclose(away, [1, 0, 0] if gap < 0.05 else [0, 0, 1], atol=1e-3)
 
 
 def test_lowest_point_of_a_turned_box():
     assert lowest_point(BOX, LEVEL) == pytest.approx(-0.02)
-    on_its_side = quaternion_exp(np.array([np.pi / 2, 0, 0]))
-    assert lowest_point(BOX, on_its_side) == pytest.approx(-0.03)
+    assert lowest_point(BOX, quaternion_exp(np.array([np.pi / 2, 0, 0]))) == pytest.approx(-0.03)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
 from osfcore.world.scenes import SceneRequest
 from osfcore.world.simulated_dynamics import SimulatedPushes
 from osfcore.world.tabletop import Tabletop
+from tests.support.errors import about
 
 BOX, CAN, GELATIN = NAMES = ("003_cracker_box", "005_tomato_soup_can", "009_gelatin_box")
 
@@ -39,29 +42,24 @@ def push(state, name: str, after: int = 2) -> np.ndarray:
     return np.pad(np.tile(way / (count * STEP_S), (count, 1)), ((0, after), (0, 1)))
 
 
-def away(state, count: int = 6) -> np.ndarray:
-    """Out of everything's way."""
-    way = state.pusher[:2] - state.poses.position[:, :2].mean(axis=0)
-    return np.tile([*(0.1 * way / np.abs(way).max()), 0.0], (count, 1))
-
-
 @pytest.mark.parametrize(("name", "off_m", "off_rad"), [(BOX, 1e-3, 0.02), (GELATIN, 1e-3, 0.02), (CAN, 2e-3, 0.1)])
 def test_pushes_go_as_on_the_table(world, start, simulated, name, off_m, off_rad):
     """The can lies on its side and rolls, which tiny differences decide."""
     actions = push(start, name)
-    told = simulated.rollout(start, actions[None])
+    predicted = simulated.rollout(start, actions[None])
     world.restore(start)
     for t, action in enumerate(actions):
         world.act(action)
         truth = world.truth()
-        np.testing.assert_allclose(told.positions[0, t + 1], truth.poses.position, atol=off_m)
-        assert rotation_angle(told.quaternions[0, t + 1], truth.poses.quaternion).max() < off_rad
-        np.testing.assert_allclose(told.pusher[0, t + 1], truth.pusher, atol=1e-9)
-    assert np.abs(told.positions[0, -1] - start.poses.position).max() > 0.02
+        np.testing.assert_allclose(predicted.positions[0, t + 1], truth.poses.position, atol=off_m)
+        assert rotation_angle(predicted.quaternions[0, t + 1], truth.poses.quaternion).max() < off_rad
+        np.testing.assert_allclose(predicted.pusher[0, t + 1], truth.pusher, atol=1e-9)
+    assert np.abs(predicted.positions[0, -1] - start.poses.position).max() > 0.02
 
 
 def test_what_the_pusher_walks_past_stays_exactly_where_it_is(start, simulated):
-    actions = away(start)
+    way = start.pusher[:2] - start.poses.position[:, :2].mean(axis=0)  # out of everything's way
+    actions = np.tile([*(0.1 * way / np.abs(way).max()), 0.0], (6, 1))
     told = simulated.rollout(start, actions[None])
     for t in range(len(actions) + 1):
         np.testing.assert_array_equal(told.positions[0, t], start.poses.position)
@@ -83,7 +81,8 @@ def test_sequences_do_not_influence_each_other(world, start, simulated):
     np.testing.assert_array_equal(together.positions[:, 0], np.broadcast_to(start.poses.position, (3, 3, 3)))
 
 
-@pytest.mark.parametrize("action", [[0.31, 0, 0], [0, 0, 0.1], [0, float("nan"), 0]])
-def test_actions_beyond_the_limits_are_refused(start, simulated, action):
-    with pytest.raises(InvalidInput, match="action 1 of sequence 0"):
-        simulated.rollout(start, np.array([[[0, 0, 0], action]]))
+def test_actions_beyond_the_limits_and_states_without_pusher_are_refused(start, simulated):
+    with pytest.raises(InvalidInput, check=about("action 1 of sequence 0")):
+        simulated.rollout(start, np.array([[[0, 0, 0], [0.31, 0, 0]]]))
+    with pytest.raises(InvalidInput, check=about("pusher")):
+        simulated.rollout(replace(start, pusher=None), np.zeros((1, 1, 3)))

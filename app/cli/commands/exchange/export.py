@@ -44,7 +44,7 @@ class ExportScene:
         if suffix == ".glb":
             from osfcore.export.meshes import scene_glb as export
         else:
-            from osfcore.export.usd.export import scene_usdz as export
+            from osfcore.export.usd import scene_usdz as export
         scene = read_scene(self.scene)
         library, fields = AssetLibrary(self.data_dir / "objects"), FieldLibrary(self.data_dir)
         scanned = [name for name in scene.state.names if library.has(name) and not self.fields]
@@ -80,7 +80,7 @@ class ExportField:
         if suffix == ".glb":
             from osfcore.export.meshes import field_glb as export
         else:
-            from osfcore.export.usd.export import field_usd
+            from osfcore.export.usd import field_usd
 
             export = partial(field_usd, is_packed=suffix == ".usdz")
         light, shape = None if self.light is None else _light(self.light), _field(self.name, self.data_dir)

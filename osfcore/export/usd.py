@@ -1,7 +1,10 @@
-"""Scenes and fields as files of Universal Scene Description, for Omniverse, Houdini, Maya, Blender and Apple's devices.
+"""Scenes and fields as Universal Scene Description (USD), for Omniverse, Houdini, Maya, Blender and Apple's devices.
 
 Axes: z up, in metres, as here. One prim, /World, holds everything. Names of prims are made of letters, digits and
 underscores; the exact ones are their display names.
+
+Raises:
+    MissingExtra: on import, if Pixar's library is not installed.
 """
 
 from __future__ import annotations
@@ -9,43 +12,37 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
 from PIL import Image
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, Vt
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from osfcore.export.meshes import field_meshes, scene_meshes
+from osfcore.export.meshes import OPENCV_TO_GLTF, camera_node, field_meshes, light_matrix, scene_meshes
+from osfcore.extras import need
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
-from osfcore.geometry.poses import orthogonal_basis
 from osfcore.io.scene_file import Scene
 from osfcore.objects.asset import TexturedMesh
 
-if TYPE_CHECKING:
-    import trimesh
+need("usd", "A USD file")
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, Vt  # noqa: E402
 
-    from osfcore.geometry.cameras import Camera
-
-
-# Matte materials of USD: a texture, or the colours of the vertices.
-
-
+_FILM = 0.36  # width of the film in tenths of a metre, as USD has it: 36 mm
+_CLIPPING_M = (0.01, 100.0)
 _TYPES, _TEXTURES = Sdf.ValueTypeNames, "textures"
 
 
 class Materials:
-    """UsdPreviewSurface without specular light, one for each mesh.
+    """Matte materials (UsdPreviewSurface), one for each mesh: a texture, or the colours of its vertices.
 
     Args:
-        stage: that takes them.
-        folder: of the stage's layer; textures come into a folder in it.
+        stage: for the materials.
+        folder: of the stage's layer; textures are written to a folder in it.
         is_unlit: colours are sent out as they are.
     """
 
@@ -54,7 +51,7 @@ class Materials:
         self._input, self._other = ("emissiveColor", "diffuseColor") if is_unlit else ("diffuseColor", "emissiveColor")
 
     def bind(self, prim: UsdGeom.Mesh, mesh: trimesh.Trimesh) -> None:
-        """Give a mesh its material, which lies below it."""
+        """Give a mesh its material, below it in the stage."""
         path = prim.GetPath().AppendChild("material")
         material = UsdShade.Material.Define(self._stage, path)
         surface = self._shader(path, "UsdPreviewSurface")
@@ -94,17 +91,9 @@ class Materials:
 
 
 def _texture_of(mesh: trimesh.Trimesh) -> Image.Image | None:
-    """The JPEG that `light_mesh` has made; None for a mesh with vertex colours."""
+    """Return the JPEG that `light_mesh` has made; None for a mesh with vertex colours."""
     material = mesh.visual.material if isinstance(mesh.visual, TextureVisuals) else None
     return material.baseColorTexture if isinstance(material, PBRMaterial) else None
-
-
-# Meshes, cameras and the light as prims of a USD stage with z up [m].
-
-
-_OPENCV_TO_USD = np.diag([1.0, -1, -1, 1])  # USD's cameras look along -z with y up
-_FILM = 0.36  # width of the film in tenths of a metre, in which USD has it: 36 mm
-_SEEN_M = (0.01, 100.0)
 
 
 class Names:
@@ -114,7 +103,7 @@ class Names:
         self._shown: dict[Sdf.Path, str] = {}
 
     def take(self, name: str) -> Sdf.Path:
-        """A free path for a name."""
+        """Reserve a free path for a name."""
         start = name if name[:1].isalpha() else f"_{name}"  # 006 would become _06
         stem, count = Tf.MakeValidIdentifier(start), 1
         path = Sdf.Path(f"/World/{stem}")
@@ -125,13 +114,13 @@ class Names:
         return path
 
     def show(self, stage: Usd.Stage) -> None:
-        """Let the prims tell their exact names."""
+        """Set the exact names as display names of the prims."""
         for path, name in self._shown.items():
             stage.GetPrimAtPath(path).SetDisplayName(name)
 
 
 def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: trimesh.Trimesh, matrix: Float[np.ndarray, "4 4"]) -> UsdGeom.Mesh:
-    """Triangles with smooth normals; texture coordinates or colours for each vertex, whichever there are."""
+    """Add triangles with smooth normals, and texture coordinates or colours for each vertex."""
     prim = UsdGeom.Mesh.Define(stage, path)
     _place(prim, matrix)
     points = np.asarray(mesh.vertices, np.float32)
@@ -153,31 +142,28 @@ def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: trimesh.Trimesh, matrix: Fl
 
 
 def add_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
-    """A pinhole camera with exactly its K: the film is shifted where the principal point is not in the middle."""
+    """Add a pinhole camera with exactly its K: an off-centre principal point becomes a shift of the film."""
     prim, K = UsdGeom.Camera.Define(stage, path), camera.intrinsics
-    _place(prim, camera.T_world_camera.matrix() @ _OPENCV_TO_USD)
+    _place(prim, camera.T_world_camera.matrix() @ OPENCV_TO_GLTF)
     focal = _FILM * K[0, 0] / camera.width
     prim.CreateFocalLengthAttr(focal)
     prim.CreateHorizontalApertureAttr(_FILM)
     prim.CreateVerticalApertureAttr(focal * camera.height / K[1, 1])
     prim.CreateHorizontalApertureOffsetAttr(focal * (camera.width / 2 - K[0, 2]) / K[0, 0])
     prim.CreateVerticalApertureOffsetAttr(focal * (K[1, 2] - camera.height / 2) / K[1, 1])
-    prim.CreateClippingRangeAttr(Gf.Vec2f(*_SEEN_M))
+    prim.CreateClippingRangeAttr(Gf.Vec2f(*_CLIPPING_M))
 
 
 def add_light(stage: Usd.Stage, names: Names, light: Light) -> None:
-    """The parallel light and the ambient one, under which a white matte surface sends out 0.75 and 0.25.
+    """Add the parallel and the ambient light, under which a white matte surface sends out 0.75 and 0.25.
 
     A distant light of angle 0 has the illuminance of its intensity: 0.75 pi. A dome of radiance 0.25 lights everything
     evenly.
 
-    Deviation: objects keep light of the dome from each other, in renderers that follow it, which they do not here.
+    Deviation: in some renderers objects shade each other from the dome's light; here they do not.
     """
     distant = UsdLux.DistantLight.Define(stage, names.take("light"))
-    right, up = orthogonal_basis(light.direction)
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([right, up, light.direction, light.position], axis=1)  # it shines along -z
-    _place(distant, matrix)
+    _place(distant, light_matrix(light))
     distant.CreateAngleAttr(0.0)  # hard shadows
     distant.CreateIntensityAttr(DIFFUSE * np.pi)
     distant.CreateNormalizeAttr(True)
@@ -189,7 +175,7 @@ def _place(prim: UsdGeom.Xformable, matrix: Float[np.ndarray, "4 4"]) -> None:
 
 
 def scene_usdz(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table: TableField) -> bytes:
-    """A scene under its light, with its textures in one file; see `add_light` and `add_camera`.
+    """Encode a scene under its light, with its textures in one file; see `add_light` and `add_camera`.
 
     Args:
         scene: its state and cameras.
@@ -204,7 +190,7 @@ def scene_usdz(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table
 
 
 def field_usd(field: KiloOSF, name: str, light: Light | None = None, *, is_packed: bool = True) -> bytes:
-    """The surface of a field with vertex colours.
+    """Encode the surface of a field with vertex colours.
 
     Args:
         field: of the object.
@@ -227,7 +213,7 @@ def _content(
     is_unlit: bool = False,
     is_packed: bool = True,
 ) -> bytes:
-    """The file; USD's library writes to the disk alone."""
+    """Encode meshes, cameras and light, through a folder: USD's library writes to the disk alone."""
     with tempfile.TemporaryDirectory(prefix="osf-usd-") as folder:
         layer = Path(folder) / "scene.usdc"
         stage = Usd.Stage.CreateNew(str(layer))
@@ -242,7 +228,7 @@ def _content(
             prim = add_mesh(stage, names.take(node), mesh, matrix)
             materials.bind(prim, mesh)
         for camera in cameras:
-            add_camera(stage, names.take(f"camera {camera.name}"), camera)
+            add_camera(stage, names.take(camera_node(camera)), camera)
         if light is not None:
             add_light(stage, names, light)
         names.show(stage)

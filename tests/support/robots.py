@@ -1,4 +1,4 @@
-"""Robots for tests: the example's server, and a table that takes its time."""
+"""Robots for tests: the example's server before a simulated table."""
 
 import contextlib
 import importlib.util
@@ -14,45 +14,14 @@ from osfcore.control import closed_loop, estimators
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import Observation
-from osfcore.geometry.workspace import STEP_S
 from osfcore.progress import Progress
 from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
-from tests.core.control.scenes import perfect_fit, sure
 from tests.live import free_port
+from tests.support.tabletop_scenes import perfect_fit, sure
 
-SERVER = Path(__file__).parents[3] / "examples" / "robot_server.py"
+SERVER = Path(__file__).parents[2] / "examples" / "robot_server.py"
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
-
-
-class Marble:
-    """A pusher alone: does of each motion as much as it is told to, and remembers what it was asked."""
-
-    def __init__(self, place=(0.0, 0.0), shares=()):
-        self.place, self.shares = np.array(place, float), list(shares)
-        self.way, self.velocities, self.told = [self.place.copy()], [], []
-
-    def reset(self, seed):
-        return self.observe()
-
-    def observe(self, *, masks=False):
-        return Observation((), np.zeros((0, 1, 1, 3), np.float32), (), None, np.array([*self.place, 0.06]), 0.0)
-
-    def act(self, action):
-        share = self.shares.pop() if self.shares else 1.0
-        self.velocities.append(np.array(action))
-        self.place = self.place + share * STEP_S * action[:2]
-        self.way.append(self.place.copy())
-
-    def start(self):
-        self.told.append("start")
-
-    def stop(self):
-        self.told.append("stop")
-
-    def close(self):
-        self.told.append("close")
 
 
 def until(holds, timeout_s=120.0):

@@ -1,4 +1,4 @@
-"""A stand-in for rosbridge with a robot behind it: JSON over a websocket, a point that moves, plain pictures."""
+"""Stand-ins for rosbridge with a robot behind it: JSON over a websocket."""
 
 import base64
 import contextlib
@@ -12,29 +12,41 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import serve
 
+from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, STEP_S
+from osfcore.io.image_file import to_uint8
 
 SIDE, EVERY_S, DEADMAN_S = 64, 0.02, 0.15
 CAMERAS = {
     name: Camera.look_at(name, place, (0, 0, 0.04), size=SIDE)
     for name, place in (("left", (0, 0.65, 0.55)), ("right", (0, -0.65, 0.55)))
 }
+TABLE_CAMERAS = ("north", "east", "south", "west")
+QUERY = f"cameras={','.join(TABLE_CAMERAS)}"
 T_BASE_TABLE = Pose(np.array([0.4, 0.1, 0.02]), np.array([np.cos(0.3), 0, 0, np.sin(0.3)]))
+_HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+_MOVES_S = 0.05
 
 
 def transform(parent, child, pose):
     (x, y, z), (w, i, j, k) = pose.position.tolist(), pose.quaternion.tolist()
-    rotation = {"x": i, "y": j, "z": k, "w": w}
-    moved = {"translation": {"x": x, "y": y, "z": z}, "rotation": rotation}
+    moved = {"translation": {"x": x, "y": y, "z": z}, "rotation": {"x": i, "y": j, "z": k, "w": w}}
     return {"header": {"frame_id": parent}, "child_frame_id": child, "transform": moved}
 
 
-class StandIn:
-    """What a robot under ROS would publish; a controller that halts where no twist has come for some time."""
+def jpeg(image):
+    return base64.b64encode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()).decode()
 
-    def __init__(self):
-        self.place, self.velocity = np.zeros(2), np.zeros(2)
+
+class StandIn:
+    """A point that moves before plain pictures; it halts where no twist has come for some time."""
+
+    def __init__(self, cameras=CAMERAS):
+        self.cameras, self.velocity = cameras, np.zeros(2)
+        self.pusher = np.array([0.0, 0.0, PUSHER_CENTRE_Z_M])
+        self.pictures = dict.fromkeys(cameras, jpeg(np.full((SIDE, SIDE, 3), 100, np.uint8)))
         self.twists, self.frames, self.silent = [], [], set()
         self.last_twist = 0.0
         self.extra = {}
@@ -43,20 +55,16 @@ class StandIn:
 
     def messages(self):
         """By topic, what is published now."""
-        told = {}
-        shade = np.full((SIDE, SIDE, 3), 100, np.uint8)
-        picture = base64.b64encode(cv2.imencode(".jpg", shade)[1].tobytes()).decode()
-        for name, camera in CAMERAS.items():
-            told[f"/{name}/image_raw/compressed"] = {"format": "jpeg", "data": picture}
+        told, static = {}, [transform("base", "table", T_BASE_TABLE)]
+        for name, camera in self.cameras.items():
+            told[f"/{name}/image_raw/compressed"] = {"format": "jpeg", "data": self.pictures[name]}
             told[f"/{name}/camera_info"] = {
-                "header": {"frame_id": f"{name}_optical"}, "width": SIDE, "height": SIDE, "d": [0.0] * 5,
-                "k": (camera.intrinsics - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]).ravel().tolist(),
+                "header": {"frame_id": f"{name}_optical"}, "width": camera.width, "height": camera.height,
+                "d": [0.0] * 5, "k": (camera.intrinsics - _HALF_PIXEL).ravel().tolist(),
             }  # fmt: skip
-        static = [transform("base", "table", T_BASE_TABLE)]
-        static += [transform("base", f"{n}_optical", T_BASE_TABLE @ c.T_world_camera) for n, c in CAMERAS.items()]
-        told["/tf_static"] = {"transforms": static}
-        pusher = Pose(np.array([*self.place, 0.06]), np.array([1.0, 0, 0, 0]))
-        told["/tf"] = {"transforms": [transform("/table", "pusher", pusher)]}
+            static.append(transform("base", f"{name}_optical", T_BASE_TABLE @ camera.T_world_camera))
+        pusher = Pose(self.pusher, np.array([1.0, 0, 0, 0]))
+        told |= {"/tf_static": {"transforms": static}, "/tf": {"transforms": [transform("/table", "pusher", pusher)]}}
         return {topic: message for topic, message in (told | self.extra).items() if topic not in self.silent}
 
     def cut(self):
@@ -66,17 +74,16 @@ class StandIn:
 
     def handle(self, connection):
         self._sockets.append(connection)
-        asked = {}
+        asked = set()
         speaker = threading.Thread(target=self._speak, args=(connection, asked))
         speaker.start()
         with contextlib.suppress(ConnectionClosed, OSError):
             for text in connection:
                 message = json.loads(text)
                 if message["op"] == "subscribe":
-                    asked[message["topic"]] = message["type"]
+                    asked.add(message["topic"])
                 elif message["op"] == "publish":
                     self._take(message["msg"])
-        asked.clear()
         self._sockets.remove(connection)
         speaker.join()
 
@@ -99,14 +106,17 @@ class StandIn:
                 self._ends.wait(EVERY_S)
 
     def control(self):
-        """Move the point in real time, until the end."""
+        """Move the pusher in real time as the last twist says, until the end."""
         before = time.monotonic()
         while not self._ends.wait(0.005):
             now = time.monotonic()
-            if now - self.last_twist > DEADMAN_S:
-                self.velocity = np.zeros(2)
-            self.place = self.place + (now - before) * self.velocity
+            self._halt_without_twists()
+            self.pusher = self.pusher + (now - before) * np.array([*self.velocity, 0.0])
             before = now
+
+    def _halt_without_twists(self):
+        if time.monotonic() - self.last_twist > DEADMAN_S:
+            self.velocity = np.zeros(2)
 
     @contextlib.contextmanager
     def running(self):
@@ -122,3 +132,32 @@ class StandIn:
                 server.shutdown()
                 for thread in threads:
                     thread.join()
+
+
+class TableStandIn(StandIn):
+    """A robot that pushes things on a simulated table, and sees them with four cameras."""
+
+    def __init__(self, table):
+        super().__init__(dict(zip(TABLE_CAMERAS, table.cameras, strict=True)))
+        self.table, self._using = table, threading.RLock()
+        self._look()
+
+    def load(self, state):
+        """Change the table's state."""
+        with self._using:
+            self.table.load(state)
+            self._look()
+
+    def control(self):
+        while not self._ends.wait(_MOVES_S):
+            self._halt_without_twists()
+            if self.velocity.any():
+                with self._using:
+                    self.table.act(np.array([*self.velocity, 0.0]) * _MOVES_S / STEP_S)
+                    self._look()
+
+    def _look(self):
+        self.pusher = self.table.truth().pusher
+        seen = self.table.render(tuple(self.cameras.values())).images
+        encoded = [jpeg(to_uint8(srgb_of_linear(image))[..., ::-1]) for image in seen]
+        self.pictures = dict(zip(self.cameras, encoded, strict=True))
