@@ -1,7 +1,7 @@
 """Algorithm 1: estimate, plan, act, look again, as a generator of events over a world.
 
 Deviations from the paper: goal poses are found once, before anything moves, so that pushes can be aimed at them and a
-goal that cannot be explained is told at once; each later estimate begins at what the dynamics model predicted; an
+goal that cannot be explained is noticed at once; each later estimate begins at what the dynamics model predicted; an
 object that was lost is looked for, a lamp that was moved is estimated again, and where nothing gets better plans are
 drawn anew.
 """
@@ -26,14 +26,15 @@ from osfcore.control.events import (
     GoalFound,
     Look,
     Looking,
+    Matter,
     Noticed,
     Observed,
     Outcome,
     Planning,
     Stepped,
 )
-from osfcore.control.first_frame import PreparedLooks
 from osfcore.control.goal import GoalImage, PhotoGoal, nearest_symmetric_goal, prefer_current_poses, snap_near_goals
+from osfcore.control.prepared import PreparedLooks
 from osfcore.control.world import Sight, World
 from osfcore.errors import InvalidInput
 from osfcore.estimation.camera_response import ImageModel
@@ -49,244 +50,10 @@ from osfcore.geometry.poses import Pose, planar_turn, rotation_angle
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import EstimatedState, Observation, SceneState
 from osfcore.geometry.workspace import PUSHER_RADIUS_M, WORKSPACE_HALF_M
-from osfcore.planning.costs import ARM_M, Cost, PoseGoal
+from osfcore.planning.costs import ARM_M, PoseGoal
 from osfcore.planning.parts import COSTS, CostInputs, PlannerInputs
 from osfcore.planning.pushes import PushProposals
 from osfcore.render.types import Quality, SceneBatch
-
-# Wall time of the stages of a closed loop, without what whoever drives its generator takes between two steps.
-
-
-StepT = TypeVar("StepT")
-
-
-class StageTimer:
-    """Adds up seconds by stage."""
-
-    def __init__(self) -> None:
-        self._seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Count the time within the context."""
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - began
-
-    def steps(self, name: str, steps: Iterator[StepT]) -> Iterator[StepT]:
-        """Pass on steps, and count the time until each of them is there."""
-        while True:
-            with self.stage(name):
-                step = next(steps, None)
-            if step is None:
-                return
-            yield step
-
-    def taken(self) -> dict[str, float]:
-        """Seconds of each stage since this was asked last."""
-        taken, self._seconds = self._seconds, {}
-        return taken
-
-
-# Relocalization of lost objects without masks: template matching in one camera's image, then tracking in all.
-
-
-_TIED = 0.02  # share of the workspace by which cameras that see it equally well may differ
-_PROBES = 21  # along a side of the workspace
-
-
-def relocalize(
-    models: ObjectModels,
-    observation: Observation,
-    last: EstimatedState,
-    rng: np.random.Generator,
-    config: GoalImageConfig | None = None,
-) -> Iterator[EstimateStep]:
-    """Look for the doubted objects anywhere on the table; the last step holds the better of both estimates.
-
-    The camera is one of those that see most of the workspace, drawn at random so that another search uses another one.
-
-    Args:
-        models: fields of the objects and the table.
-        observation: all views, at best without anything in front.
-        last: the estimate whose doubted objects are looked for.
-        rng: of the search.
-        config: how the one image is searched.
-    """
-    state = last.state
-    lost = [n for n, doubt in enumerate(last.doubts) if doubt]
-    shares = np.array([_share_of_workspace(camera) for camera in observation.cameras])
-    view = int(rng.choice(np.flatnonzero(shares >= shares.max() - _TIED)))
-    alone = Observation(
-        observation.cameras[view : view + 1], observation.images[view : view + 1], observation.names, None, None,
-        observation.time_s,
-    )  # fmt: skip
-    first_frame = None
-    for step in estimate_goal(models, alone, state, config):
-        first_frame = step.estimate
-        yield replace(step, estimate=None)
-    assert first_frame is not None, "the last step brings the estimate"
-    expected = replace(_with_poses_of(state, first_frame.state, lost), pusher=observation.pusher)
-    for step in estimate_next(models, observation, expected, rng):
-        update = step.estimate
-        is_worse = update is not None and sum(map(bool, update.doubts)) > len(lost)
-        yield replace(step, estimate=last) if is_worse else step
-
-
-def _share_of_workspace(camera: Camera) -> float:
-    """Return the share of a grid of points on the workspace that a camera sees."""
-    side = np.linspace(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, _PROBES)
-    points = np.stack([*np.meshgrid(side, side), np.zeros((_PROBES, _PROBES))], axis=-1)
-    depth = camera.T_world_camera.inverse().apply(points)[..., 2]
-    pixels = camera.project(np.where(depth[..., None] > 0, points, np.nan))
-    with np.errstate(invalid="ignore"):
-        return float(np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=-1).mean())
-
-
-def _with_poses_of(state: SceneState, other: SceneState, numbers: list[int]) -> SceneState:
-    """The state with some of its objects where another one has them."""
-    positions, quaternions = state.poses.position.copy(), state.poses.quaternion.copy()
-    for n in numbers:
-        pose = other.pose(state.names[n])
-        positions[n], quaternions[n] = pose.position, pose.quaternion
-    return replace(state, poses=Pose(positions, quaternions))
-
-
-# Models and pictures that agree: what the first frame tells of exposure, response, ambient light and table is kept.
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class AdaptedModels:
-    """Models of the objects in a scene, and how pictures are made to look as these do.
-
-    Attributes:
-        models: fields and table, with the scene's ambient light and albedo.
-        image_model: of the pictures; None for those that fields were made for.
-    """
-
-    models: ObjectModels
-    image_model: ImageModel | None = None
-
-    def to(self, image_model: ImageModel | None, names: tuple[str, ...]) -> AdaptedModels:
-        """These, which must not be adapted yet, for pictures of another kind.
-
-        Args:
-            image_model: of the pictures; None leaves everything as it is.
-            names: of the objects that are needed.
-        """
-        return self if image_model is None else AdaptedModels(adapted(self.models, names, image_model), image_model)
-
-    def normalized(self, observation: Observation) -> Observation:
-        """Pictures as these models show them."""
-        return observation if self.image_model is None else self.image_model.normalized(observation)
-
-    def normalized_goal(self, goal: GoalImage) -> GoalImage:
-        """A goal image likewise."""
-        return goal if self.image_model is None else replace(goal, image=self.normalized(goal.observed(())).images[0])
-
-
-def estimate_goal_image(
-    usual: AdaptedModels,
-    scene: AdaptedModels,
-    goal: GoalImage,
-    prior: SceneState,
-    config: GoalImageConfig | None = None,
-    shares: Mapping[str, float] | None = None,
-) -> Iterator[EstimateStep]:
-    """The goal image as the scene's cameras would take it and, should that be doubtful, as fields were made for.
-
-    Args:
-        usual: models that are not adapted.
-        scene: models for the pictures of the first frame.
-        goal: one view.
-        prior: how the objects lie now.
-        config: how much work to do.
-        shares: by object, its residual in the first frame as a share of its level, see `goal_allowance`.
-    """
-    best = yield from all_but_last(_estimated(scene, goal, prior, config, shares))
-    if scene.image_model is not None and not _is_trusted(best):
-        yield replace(best, estimate=None)
-        other = yield from all_but_last(_estimated(usual, goal, prior, config, shares))
-        best = other if _is_trusted(other) else best
-    yield best
-
-
-def _estimated(
-    fitting: AdaptedModels,
-    goal: GoalImage,
-    prior: SceneState,
-    config: GoalImageConfig | None,
-    shares: Mapping[str, float] | None,
-) -> Iterator[EstimateStep]:
-    seen = fitting.normalized_goal(goal).observed(prior.names)
-    for step in estimate_goal(fitting.models, seen, prior, config, shares):
-        yield step if step.estimate is None else replace(step, image_model=fitting.image_model)
-
-
-def _is_trusted(step: EstimateStep) -> bool:
-    return step.estimate is not None and step.estimate.trusted
-
-
-# Monitoring of a closed loop: distance to the goal, stalled progress, changes that no push explains.
-
-
-_MAX_STALLED = 16  # actions without progress
-_PROGRESS_M = 0.003
-_LAMP_RAD = np.deg2rad(4.0)
-_MOVED_M = 0.03  # an object this far from where it was expected, and out of the pusher's reach, was carried
-_REACH_M = 0.2  # from the pusher to the middle of what it may have pushed, perhaps by way of another object
-
-
-def offsets(goal: PoseGoal, state: SceneState) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """How far each object is from where it should be: on the table's plane [m], and turned [rad]."""
-    target = np.array([goal.pose(name).quaternion for name in state.names]).reshape(-1, 4)
-    turned = rotation_angle(state.poses.quaternion, target)
-    return np.linalg.norm(goal.offsets_m(state), axis=1), np.asarray(turned)
-
-
-def lies_otherwise(goal: PoseGoal, state: SceneState) -> Bool[np.ndarray, "N"]:
-    """Which objects lie on another side than in the goal: turning them about the vertical would not do."""
-    turns = (planar_turn(state.pose(name).quaternion, goal.pose(name).quaternion) for name in state.names)
-    return np.array([turn is None for turn in turns], bool)
-
-
-class ProgressMonitor:
-    """Detects that the distance to the goal no longer shrinks."""
-
-    def __init__(self) -> None:
-        self._least, self._since = np.inf, 0
-
-    def is_stalled(self, distance_m: float) -> bool:
-        """Take the distance after each action; true once it has not shrunk for 16 actions, and counting restarts."""
-        if distance_m < self._least - _PROGRESS_M:
-            self._least, self._since = distance_m, 0
-            return False
-        self._since += 1
-        if self._since < _MAX_STALLED:
-            return False
-        self._least, self._since = distance_m, 0
-        return True
-
-
-def lamp_moved(before: Light, now: Light) -> float | None:
-    """By which angle the lamp was moved [rad]; None if it was not."""
-    angle = before.angle_to(now)
-    return angle if angle > _LAMP_RAD else None
-
-
-def moved_by_hand(expected: SceneState, now: SceneState) -> tuple[str, ...]:
-    """Objects that are not where they were expected, too far from the pusher for a push to be the cause."""
-    assert now.pusher is not None
-    shift = np.linalg.norm(now.poses.position - expected.poses.position, axis=1)
-    ends = [now.pusher] if expected.pusher is None else [now.pusher, expected.pusher]
-    away = np.min(
-        [np.linalg.norm(expected.poses.position[:, :2] - end[:2], axis=1) for end in ends], axis=0
-    )  # fmt: skip
-    is_moved = (shift > _MOVED_M) & (away > _REACH_M + PUSHER_RADIUS_M)
-    return tuple(name for name, flag in zip(now.names, is_moved, strict=True) if flag)
-
 
 _SHOWN = Quality(samples_per_side=2)
 _LOST_AFTER = 2  # looks at which an object is doubted, one after another
@@ -343,7 +110,7 @@ class Episode:
         self._expected: SceneState | None = None  # what the last action should have led to
 
     def run(self) -> Iterator[Event]:
-        """Everything, until a `Finished`.
+        """Yield everything that happens, until a `Finished`.
 
         Raises:
             InvalidInput: if the world gives no masks for the first frame, or goal and scene hold other objects.
@@ -377,15 +144,17 @@ class Episode:
 
     def _begin(self) -> Iterator[Event]:
         observation = yield from self._observe(masks=self._start is None)
-        self._check_objects(observation.names)
+        if isinstance(self._target, PoseGoal) and set(self._target.names) != set(observation.names):
+            raise InvalidInput("objects of the goal", ", ".join(self._target.names), ", ".join(observation.names))
         if self._start is None:
             steps = self._how.first_frame(self._models.appearance, observation, self._rng)
             found = yield from self._look("first", observation, steps)
             self._estimate = found.estimate
             self._scene = self._of_goal = self._scene.to(found.image_model, observation.names)
             observation = self._scene.normalized(observation)
-            if found.image_model is not None and found.image_model.told:
-                yield self._noticed("pictures", f"The pictures are unusual ({found.image_model.told}); allowed for.")
+            if found.image_model is not None and found.image_model.oddities:
+                text = f"The pictures are unusual ({found.image_model.oddities}); allowed for."
+                yield self._noticed("pictures", text)
         else:
             self._estimate = self._start
         self._estimate = self._estimate.with_pusher(observation.pusher)
@@ -409,7 +178,7 @@ class Episode:
     def _look(
         self, look: Look, observation: Observation, steps: Iterator[EstimateStep]
     ) -> Iterator[Event]:  # returns the last EstimateStep
-        """What was prepared, if it fits; else what an estimator finds."""
+        """Take what was prepared, if it fits; else run an estimator."""
         with self._timer.stage(look):
             step = None if self._prepared is None else self._prepared.step(look, self._models.appearance, observation)
         if step is None:
@@ -419,10 +188,6 @@ class Episode:
         yield self._noticed("prepared", f"The estimate of the {what} was prepared with this example.")
         return step
 
-    def _check_objects(self, names: tuple[str, ...]) -> None:
-        if isinstance(self._target, PoseGoal) and set(self._target.names) != set(names):
-            raise InvalidInput("objects of the goal", ", ".join(self._target.names), ", ".join(names))
-
     def _run_estimator(
         self, look: Look, steps: Iterator[EstimateStep]
     ) -> Iterator[Event]:  # returns the last EstimateStep
@@ -430,8 +195,8 @@ class Episode:
         for step in self._timer.steps(look if look in ("first", "goal") else "estimate", steps):
             last = step
             yield Looking(self._number, look, step)
-        assert last is not None
-        assert last.estimate is not None, "the last step brings the estimate"
+        if last is None or last.estimate is None:
+            raise InvalidInput("last step of the estimator", "without an estimate", "one that holds it")
         return last
 
     def _look_again(self) -> Iterator[Event]:
@@ -521,13 +286,11 @@ class Episode:
         plan = self.settings.plan
         self._planner.settings = replace(plan, horizon=min(plan.horizon, self._left()))
         self._goal = nearest_symmetric_goal(self._goal, self._estimate.state, self._models.symmetries)
-        rounds = self._planner.plan(self._estimate.state, self._goal, self._cost(), self._rng, self._before)
+        make_cost = self._parts.cost or COSTS[self.settings.cost]
+        cost = make_cost(CostInputs(self._goal, self._camera, self._image, self._light, self._of_goal.models.together))
+        rounds = self._planner.plan(self._estimate.state, self._goal, cost, self._rng, self._before)
         for one in self._timer.steps("plan", rounds):
             yield Planning(self._number, one)
-
-    def _cost(self) -> Cost:
-        make = self._parts.cost or COSTS[self.settings.cost]
-        return make(CostInputs(self._goal, self._camera, self._image, self._light, self._of_goal.models.together))
 
     def _act(self) -> Iterator[Event]:
         state = self._estimate.state
@@ -545,7 +308,7 @@ class Episode:
         self._number += 1
         return ActionExecuted(self._number, action)
 
-    # Telling
+    # Reporting
 
     def _outcome(self) -> tuple[Outcome, str] | None:
         far, turned = offsets(self._goal, self._estimate.state)
@@ -579,10 +342,10 @@ class Episode:
         """Actions that may still be executed."""
         return self._counted_from + self.settings.steps - self._number
 
-    def _noticed(self, matter: str, text: str, names: tuple[str, ...] = ()) -> Noticed:
+    def _noticed(self, matter: Matter, text: str, names: tuple[str, ...] = ()) -> Noticed:
         if matter in _DISTURBANCES and self.settings.renewed and self._renewals < _RENEWALS:
             self._counted_from, self._renewals = self._number, self._renewals + 1
-        return Noticed(self._number, matter, text, names)  # pyright: ignore[reportArgumentType]
+        return Noticed(self._number, matter, text, names)
 
     def _finished(self, outcome: Outcome, text: str) -> Finished:
         return Finished(self._number, outcome, text, self._estimate.state)
@@ -592,3 +355,227 @@ def _future(futures: Rollouts, step: int, state: SceneState) -> SceneState:
     """The predicted state after some actions; the pusher where it is then, for nothing has been pushed since."""
     poses = Pose(futures.positions[0, step], futures.quaternions[0, step])
     return replace(state, poses=poses, pusher=futures.pusher[0, step])
+
+
+# Models and pictures that agree: exposure, response, ambient light and table as the first frame showed them are kept.
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AdaptedModels:
+    """Models of the objects in a scene, and how pictures are made to look as these do.
+
+    Attributes:
+        models: fields and table, with the scene's ambient light and albedo.
+        image_model: of the pictures; None for those that fields were made for.
+    """
+
+    models: ObjectModels
+    image_model: ImageModel | None = None
+
+    def to(self, image_model: ImageModel | None, names: tuple[str, ...]) -> AdaptedModels:
+        """Adapt these models, which must not be adapted yet, to pictures of another kind.
+
+        Args:
+            image_model: of the pictures; None leaves everything as it is.
+            names: of the objects that are needed.
+        """
+        return self if image_model is None else AdaptedModels(adapted(self.models, names, image_model), image_model)
+
+    def normalized(self, observation: Observation) -> Observation:
+        """Return pictures as these models show them."""
+        return observation if self.image_model is None else self.image_model.normalized(observation)
+
+    def normalized_goal(self, goal: GoalImage) -> GoalImage:
+        """Return a goal image likewise."""
+        return goal if self.image_model is None else replace(goal, image=self.normalized(goal.observed(())).images[0])
+
+
+def estimate_goal_image(
+    usual: AdaptedModels,
+    scene: AdaptedModels,
+    goal: GoalImage,
+    prior: SceneState,
+    config: GoalImageConfig | None = None,
+    shares: Mapping[str, float] | None = None,
+) -> Iterator[EstimateStep]:
+    """Estimate the goal image as the scene's cameras would take it and, if doubtful, as fields were made for.
+
+    Args:
+        usual: models that are not adapted.
+        scene: models for the pictures of the first frame.
+        goal: one view.
+        prior: how the objects lie now.
+        config: how much work to do.
+        shares: by object, its residual in the first frame as a share of its level, see `goal_allowance`.
+    """
+    best = yield from all_but_last(_estimated(scene, goal, prior, config, shares))
+    if scene.image_model is not None and not _is_trusted(best):
+        yield replace(best, estimate=None)
+        other = yield from all_but_last(_estimated(usual, goal, prior, config, shares))
+        best = other if _is_trusted(other) else best
+    yield best
+
+
+def _estimated(
+    fitting: AdaptedModels,
+    goal: GoalImage,
+    prior: SceneState,
+    config: GoalImageConfig | None,
+    shares: Mapping[str, float] | None,
+) -> Iterator[EstimateStep]:
+    seen = fitting.normalized_goal(goal).observed(prior.names)
+    for step in estimate_goal(fitting.models, seen, prior, config, shares):
+        yield step if step.estimate is None else replace(step, image_model=fitting.image_model)
+
+
+def _is_trusted(step: EstimateStep) -> bool:
+    return step.estimate is not None and step.estimate.trusted
+
+
+# Relocalization of lost objects without masks: template matching in one camera's image, then tracking in all.
+
+
+_TIED = 0.02  # share of the workspace by which cameras that see it equally well may differ
+_PROBES = 21  # along a side of the workspace
+
+
+def relocalize(
+    models: ObjectModels,
+    observation: Observation,
+    last: EstimatedState,
+    rng: np.random.Generator,
+    config: GoalImageConfig | None = None,
+) -> Iterator[EstimateStep]:
+    """Look for the doubted objects anywhere on the table; the last step holds the better of both estimates.
+
+    The camera is one of those that see most of the workspace, drawn at random so that another search uses another one.
+
+    Args:
+        models: fields of the objects and the table.
+        observation: all views, at best without anything in front.
+        last: the estimate whose doubted objects are looked for.
+        rng: of the search.
+        config: how the one image is searched.
+    """
+    state = last.state
+    lost = [n for n, doubt in enumerate(last.doubts) if doubt]
+    shares = np.array([_share_of_workspace(camera) for camera in observation.cameras])
+    view = int(rng.choice(np.flatnonzero(shares >= shares.max() - _TIED)))
+    alone = Observation(
+        observation.cameras[view : view + 1], observation.images[view : view + 1], observation.names, None, None,
+        observation.time_s,
+    )  # fmt: skip
+    found = None
+    for step in estimate_goal(models, alone, state, config):
+        found = step.estimate
+        yield replace(step, estimate=None)
+    assert found is not None
+    poses = Pose.stacked((found.state if n in lost else state).pose(name) for n, name in enumerate(state.names))
+    expected = replace(state, poses=poses, pusher=observation.pusher)
+    for step in estimate_next(models, observation, expected, rng):
+        update = step.estimate
+        is_worse = update is not None and sum(map(bool, update.doubts)) > len(lost)
+        yield replace(step, estimate=last) if is_worse else step
+
+
+def _share_of_workspace(camera: Camera) -> float:
+    """Return the share of a grid of points on the workspace that a camera sees."""
+    side = np.linspace(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, _PROBES)
+    points = np.stack([*np.meshgrid(side, side), np.zeros((_PROBES, _PROBES))], axis=-1)
+    depth = camera.T_world_camera.inverse().apply(points)[..., 2]
+    pixels = camera.project(np.where(depth[..., None] > 0, points, np.nan))
+    with np.errstate(invalid="ignore"):
+        return float(np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=-1).mean())
+
+
+# Monitoring of a closed loop: distance to the goal, stalled progress, changes that no push explains.
+
+
+_MAX_STALLED = 16  # actions without progress
+_PROGRESS_M = 0.003
+_LAMP_RAD = np.deg2rad(4.0)
+_MOVED_M = 0.03  # an object this far from where it was expected, and out of the pusher's reach, was carried
+_REACH_M = 0.2  # from the pusher to the middle of what it may have pushed, perhaps by way of another object
+
+
+def offsets(goal: PoseGoal, state: SceneState) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    """Measure how far each object is from where it should be: on the table's plane [m], and turned [rad]."""
+    target = np.array([goal.pose(name).quaternion for name in state.names]).reshape(-1, 4)
+    turned = rotation_angle(state.poses.quaternion, target)
+    return np.linalg.norm(goal.offsets_m(state), axis=1), np.asarray(turned)
+
+
+def lies_otherwise(goal: PoseGoal, state: SceneState) -> Bool[np.ndarray, "N"]:
+    """Find objects that lie on another side than in the goal: turning them about the vertical would not do."""
+    turns = (planar_turn(state.pose(name).quaternion, goal.pose(name).quaternion) for name in state.names)
+    return np.array([turn is None for turn in turns], bool)
+
+
+class ProgressMonitor:
+    """Detects that the distance to the goal no longer shrinks."""
+
+    def __init__(self) -> None:
+        self._least, self._since = np.inf, 0
+
+    def is_stalled(self, distance_m: float) -> bool:
+        """Take the distance after each action; true once it has not shrunk for 16 actions, and counting restarts."""
+        if distance_m < self._least - _PROGRESS_M:
+            self._least, self._since = distance_m, 0
+            return False
+        self._since += 1
+        if self._since < _MAX_STALLED:
+            return False
+        self._least, self._since = distance_m, 0
+        return True
+
+
+def lamp_moved(before: Light, now: Light) -> float | None:
+    """Return the angle by which the lamp was moved [rad]; None if it was not."""
+    angle = before.angle_to(now)
+    return angle if angle > _LAMP_RAD else None
+
+
+def moved_by_hand(expected: SceneState, now: SceneState) -> tuple[str, ...]:
+    """Find objects that are not where they were expected, too far from the pusher for a push to be the cause."""
+    assert now.pusher is not None
+    shift = np.linalg.norm(now.poses.position - expected.poses.position, axis=1)
+    ends = [now.pusher] if expected.pusher is None else [now.pusher, expected.pusher]
+    away = np.min([np.linalg.norm(expected.poses.position[:, :2] - end[:2], axis=1) for end in ends], axis=0)
+    is_moved = (shift > _MOVED_M) & (away > _REACH_M + PUSHER_RADIUS_M)
+    return tuple(name for name, flag in zip(now.names, is_moved, strict=True) if flag)
+
+
+# Wall time of the stages of a closed loop, without what whoever drives its generator takes between two steps.
+
+
+StepT = TypeVar("StepT")
+
+
+class StageTimer:
+    """Adds up seconds by stage."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the time within the context."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - began
+
+    def steps(self, name: str, steps: Iterator[StepT]) -> Iterator[StepT]:
+        """Pass on steps, and count the time until each of them is there."""
+        while True:
+            with self.stage(name):
+                step = next(steps, None)
+            if step is None:
+                return
+            yield step
+
+    def taken(self) -> dict[str, float]:
+        """Seconds of each stage since this was asked last."""
+        taken, self._seconds = self._seconds, {}
+        return taken

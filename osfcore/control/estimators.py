@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.control.first_frame import estimate_first
 from osfcore.dynamics.dynamics_model import DynamicsModel
 from osfcore.dynamics.graph import read_network
 from osfcore.dynamics.rollout import PushModel, load_shapes, network_path
 from osfcore.dynamics.shapes import ObjectShape
-from osfcore.estimation.first_frame import FirstFrameConfig
+from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
 from osfcore.estimation.goal_image import GoalImageConfig
 from osfcore.estimation.objective import ObjectModels
 from osfcore.estimation.steps import EstimateStep
@@ -74,11 +73,8 @@ class Estimators:
 ESTIMATOR = PartKind("estimator", ("first_frame", "later_frame"))
 
 
-def _ours(_data_dir: Path) -> Estimators:
-    return Estimators()
-
-
-ESTIMATORS: Mapping[str, Callable[[Path], Estimators]] = {"ours": _ours}  # from the data directory
+# By name, how to make estimators from the data directory.
+ESTIMATORS: Mapping[str, Callable[[Path], Estimators]] = {"ours": lambda _data_dir: Estimators()}
 
 
 @dataclass(frozen=True, slots=True)

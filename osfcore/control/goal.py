@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.hypotheses import with_pose
 from osfcore.estimation.objective import FINE_SIDE, ObjectModels, SceneParameters, loss_of, views_of
+from osfcore.estimation.uncertainty import reason_for
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
 from osfcore.geometry.states import EstimatedState, Observation, SceneState
@@ -60,7 +60,7 @@ class PhotoGoal(PoseGoal):
 def prefer_current_poses(
     models: ObjectModels, goal: GoalImage, estimate: EstimatedState, now: SceneState
 ) -> EstimatedState:
-    """The estimate of a goal image, with objects where they are now if the image shows nothing against it.
+    """Change the estimate of a goal image: objects are where they are now if the image shows nothing against it.
 
     What hides behind something, or lies beyond the image's border, would else be taken to wherever it hid best.
 
@@ -74,16 +74,16 @@ def prefer_current_poses(
     params = SceneParameters.of(estimate.state, None)
     least, doubts = loss_of(models, views, params), list(estimate.doubts)
     for n, name in enumerate(estimate.state.names):
-        here = with_pose(params, n, now.pose(name))
+        here = params.with_pose(n, now.pose(name))
         loss = loss_of(models, views, here)
         if loss <= _NO_WORSE * least:
             params, least, doubts[n] = here, min(loss, least), ""
-    reasons = [f"{name}: {doubt}" for name, doubt in zip(params.names, doubts, strict=True) if doubt]
-    return replace(estimate, state=params.state(), doubts=tuple(doubts), reason="; ".join(reasons))
+    reason = reason_for(params.names, doubts)
+    return replace(estimate, state=params.state(), doubts=tuple(doubts), reason=reason)
 
 
 def snap_near_goals(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
-    """The goal, with objects that are there already (but for what estimates err) left exactly where they are.
+    """Leave objects that are at their goals already, but for what estimates err, exactly where they are.
 
     Args:
         goal: where each object of the state should be.
@@ -101,7 +101,7 @@ def snap_near_goals(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, 
 
 
 def nearest_symmetric_goal(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
-    """The goal with each orientation replaced by the one nearest to the object's own of those that look the same.
+    """Replace each orientation of a goal by the one nearest to the object's own of those that look the same.
 
     Args:
         goal: where each object should be; positions stay.
@@ -112,9 +112,8 @@ def nearest_symmetric_goal(goal: PoseGoal, state: SceneState, symmetries: Mappin
     for name, symmetry in symmetries.items():
         if name in goal.names and symmetry.kind != "none":
             pose = goal.pose(name)
-            turned[name] = Pose(
-                pose.position, _nearest_symmetric(symmetry, pose.quaternion, state.pose(name).quaternion)
-            )
+            nearest = _nearest_symmetric(symmetry, pose.quaternion, state.pose(name).quaternion)
+            turned[name] = Pose(pose.position, nearest)
     return goal.replaced(turned)
 
 
@@ -127,6 +126,5 @@ def _nearest_symmetric(
         quarter = quaternion_multiply(goal, np.array([0.0, *np.asarray(symmetry.axis)]))
         angle = 2 * np.arctan2(quarter @ current, goal @ current)
         turns = [quaternion_exp(angle * np.asarray(symmetry.axis))]
-    return min(
-        (quaternion_multiply(goal, turn) for turn in turns), key=lambda other: float(rotation_angle(other, current))
-    )
+    alike = (quaternion_multiply(goal, turn) for turn in turns)
+    return min(alike, key=lambda other: float(rotation_angle(other, current)))

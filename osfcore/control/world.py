@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +15,7 @@ from osfcore.geometry.states import Observation, SceneState
 class World(Protocol):
     """A table with objects, cameras and one pusher that follows velocities.
 
-    The simulator (`osfcore.world.tabletop.Tabletop`) is one implementation. Nothing here tells poses or depth: whoever
+    The simulator (`osfcore.world.tabletop.Tabletop`) is one implementation. Nothing here gives poses or depth: whoever
     plans has to see.
     """
 
@@ -41,18 +41,18 @@ class World(Protocol):
 
 
 class SimulatedWorld(World, Protocol):
-    """A world that knows the truth, which reports tell; nothing that estimates or plans asks for it."""
+    """A world that knows the truth, for reports; nothing that estimates or plans asks for it."""
 
     def truth(self) -> SceneState:
         """Where everything truly is."""
         ...
 
     def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
-        """What any cameras would see now."""
+        """Take an image with any cameras."""
         ...
 
 
-# What reaches the estimators of a closed loop: cameras that see something, at the brightness of the first images.
+# Observations for the estimators of a closed loop: cameras that see something, at the brightness of the first images.
 #
 # A covered camera shows one colour; its image would pull every estimate. A lamp that is dimmed makes all of an
 # image darker by one factor, lit and shadowed parts alike, while one that is moved does not: its shadows keep their
@@ -62,7 +62,7 @@ class SimulatedWorld(World, Protocol):
 
 _BLIND = 0.015  # standard deviation of an image that shows one colour [radiance]
 _FEWEST = 2  # cameras that an estimate needs
-_DARKEST = 0.02  # radiance below which a pixel tells nothing of factors
+_DARKEST = 0.02  # radiance below which a pixel does not count for factors
 _CHANGE, _AGREES = 0.1, 0.08  # logarithms: of a factor that counts, and of those that are the same
 _ALIKE = 0.6  # share of pixels that must agree
 _SHADOWED, _FEW = 0.55, 40  # of the median: pixels in shadow, if there are that many
@@ -73,11 +73,11 @@ class SightChange:
     """Something about the pictures that a person should know.
 
     Attributes:
-        matter: "camera" or "brightness".
+        matter: what it is about.
         text: a sentence.
     """
 
-    matter: str
+    matter: Literal["camera", "brightness"]
     text: str
 
 
@@ -90,9 +90,11 @@ class Sight:
         self._before: Observation | None = None
 
     def take(self, observation: Observation) -> tuple[Observation, tuple[SightChange, ...]]:
-        """What an estimator should see of an observation, and what has changed about it."""
+        """Return what an estimator should see of an observation, and what has changed about it."""
         blind = blind_cameras(observation)
-        changes = self._told_cameras(blind)
+        lost, back = sorted(blind - self._blind), sorted(self._blind - blind)
+        changes = [SightChange("camera", f"Camera {name} sees nothing; going on with the others.") for name in lost]
+        changes += [SightChange("camera", f"Camera {name} sees again.") for name in back]
         self._blind = blind
         seen = without_cameras(observation, blind)
         factor = None if self._before is None else brightness_change(self._before, seen)
@@ -106,21 +108,16 @@ class Sight:
         images = np.clip(seen.images / np.float32(self._brightness), 0, 1)
         return replace(seen, images=images) if self._brightness != 1.0 else seen, tuple(changes)
 
-    def _told_cameras(self, blind: frozenset[str]) -> list[SightChange]:
-        lost, back = sorted(blind - self._blind), sorted(self._blind - blind)
-        told = [SightChange("camera", f"Camera {name} sees nothing; going on with the others.") for name in lost]
-        return told + [SightChange("camera", f"Camera {name} sees again.") for name in back]
-
 
 def blind_cameras(observation: Observation) -> frozenset[str]:
-    """Names of cameras whose images show one colour; none if fewer than two others are left."""
+    """Return names of cameras whose images show one colour; none if fewer than two others are left."""
     spread = observation.images.std(axis=(1, 2)).max(axis=1)
     names = frozenset(c.name for c, one in zip(observation.cameras, spread, strict=True) if one < _BLIND)
     return names if len(observation.cameras) - len(names) >= _FEWEST else frozenset()
 
 
 def without_cameras(observation: Observation, names: frozenset[str]) -> Observation:
-    """An observation with some of its views left out."""
+    """Leave some views out of an observation."""
     kept = [v for v, camera in enumerate(observation.cameras) if camera.name not in names]
     if len(kept) == len(observation.cameras):
         return observation
@@ -130,7 +127,7 @@ def without_cameras(observation: Observation, names: frozenset[str]) -> Observat
 
 
 def brightness_change(before: Observation, now: Observation) -> float | None:
-    """The factor by which everything became brighter; None if it did not, or not everything alike.
+    """Measure the factor by which everything became brighter; None if it did not, or not everything alike.
 
     Args:
         before: an observation.

@@ -72,7 +72,7 @@ class ImageModel:
         table: T, factors on the table's albedo, per colour.
         encoding: of the values that pictures hold.
         surroundings: linear radiance of what lies beyond the table, in the pictures; None where it is as in fields.
-            Nobody knows what lights it, so that it tells nothing of the others.
+            Nobody knows what lights it, so that the others do not follow from it.
     """
 
     gain: Float[np.ndarray, "3"]
@@ -83,17 +83,17 @@ class ImageModel:
 
     @property
     def scale(self) -> float:
-        """What brings the radiance of a white surface that faces the lamp back to 1."""
+        """The factor that brings the radiance of a white surface that faces the lamp back to 1."""
         return 1 / (AMBIENT * self.ambient + DIFFUSE)
 
     @property
     def is_usual(self) -> bool:
-        """Whether fields were made for such pictures, within what a fit to right poses may be off."""
+        """Decide whether fields were made for such pictures, within what a fit to right poses may be off."""
         factors = np.array([*self.gain, self.ambient, *self.table])
         return self.encoding == "linear" and bool(np.all(np.abs(np.log(factors)) < _USUAL))
 
     @property
-    def told(self) -> str:
+    def oddities(self) -> str:
         """What is unusual about the pictures, for a person; "" if nothing is."""
         parts = ["sRGB values"] if self.encoding == "srgb" else []
         for what, factor in (("exposure", self.gain), ("ambient light", self.ambient), ("table", self.table)):

@@ -2,7 +2,7 @@
 
 Two independent cues, neither of which needs exact poses. Colour indexing (Swain and Ballard, 1991) compares the
 chromaticities of what is no table with those of the objects' fields: matte shading under a white light does not change
-them. Template matching puts the objects where they explain the photo best, and tells how much worse the best one's
+them. Template matching puts the objects where they explain the photo best, and measures how much worse the best one's
 absence would make it. A logistic regression joins both; see `_EVIDENCE`.
 """
 
@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from osfcore.estimation.hypotheses import match_templates, quick_scene, table_errors, without_objects
-from osfcore.estimation.objective import FINE_SIDE, QUALITY, ObjectModels, loss_of, views_of, yaw_quaternions
+from osfcore.estimation.hypotheses import SceneAssembly, match_templates, table_errors, without_objects
+from osfcore.estimation.objective import FINE_SIDE, QUALITY, ObjectModels, full_circle, loss_of, views_of
 from osfcore.estimation.steps import ContentCheck, Verdict
 from osfcore.geometry.cameras import goal_camera
-from osfcore.geometry.poses import quaternion_multiply, rotate
+from osfcore.geometry.poses import quaternion_multiply
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.render.types import SceneBatch
 
@@ -95,7 +95,7 @@ class ContentChecker:
             chosen = np.linspace(0, len(resting.heights) - 1, _VIEWS_OF_PALETTE).astype(int)
             quaternions = resting.quaternions[chosen]
             positions = np.zeros((len(chosen), 3))
-            positions[:, 2] = resting.heights[chosen] - rotate(quaternions, resting.centre)[:, 2]
+            positions[:, 2] = resting.origin_heights[chosen]
             light = np.tile([0.36, -0.48, 0.8], (len(chosen), 1))
             batch = SceneBatch((name,), positions[:, None], quaternions[:, None], light, None)
             camera = goal_camera(_PALETTE_SIDE)
@@ -106,15 +106,14 @@ class ContentChecker:
 
     def _template_evidence(self, observation: Observation, prior: SceneState) -> float:
         coarse, rough = views_of(observation, _COARSE_SIDE), views_of(observation, _ROUGH_SIDE)
-        turns = yaw_quaternions(np.arange(_YAWS) * 2 * np.pi / _YAWS)
         matches, behind = [], table_errors(self._models, coarse)
         for name in observation.names:
             pose = prior.pose(name)
-            quaternions = quaternion_multiply(turns, pose.quaternion[None])
+            quaternions = quaternion_multiply(full_circle(_YAWS), pose.quaternion[None])
             heights = np.full(_YAWS, pose.position[2])
             found = match_templates(self._models, coarse, name, quaternions, heights, most=_MATCHES, behind=behind)
             matches.append(found)
-        params = quick_scene(self._models, rough, coarse, observation.names, matches)
+        params = SceneAssembly(self._models, rough, coarse, matches).quick_scene(observation.names)
         loss = loss_of(self._models, coarse, params)
         without = [loss_of(self._models, coarse, without_objects(params, [n])) for n in range(len(observation.names))]
         return float(np.log(max(without) / loss))

@@ -4,18 +4,29 @@ In the paper's order: the light is held overhead and each object's pose is optim
 (eq. 5); then CMA-ES optimises all poses and the light over whole images (eq. 6). Deviations: the first part starts from
 every resting orientation of an object rather than from one guess, since the loss has many local minima over
 orientations; a grid search of the hemisphere initialises the light; Gauss-Newton refines what CMA-ES finds.
+
+Pictures may differ from those that fields were made for in exposure, encoding, ambient light and the table's colour.
+Where the table looks as it is known (`check_table`), the method above does everything. Where no shadow decides, it
+is asked first, and its answer taken if the loss at its end is low or the image model at its poses the usual one: under
+a high lamp and beside one object exposure, ambient light and table explain each other. Otherwise an image model is
+fitted first (`Calibrator`), with each object in the pose that fits its masks best at any brightness, once for linear
+pictures and once for sRGB ones. What leaves less unexplained is tried first; the other one too if the loss at its end
+is high or the estimate doubted: then the lower loss decides. Pictures and fields are made to agree, and the usual
+method finds poses and lamp. From these the image model is searched for once more, and refined in turn with poses and
+lamp (Gauss-Newton) until the lamp stands still.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.hypotheses import compare_orientations, side_hypotheses, yaw_hypotheses
+from osfcore.estimation.camera_response import Encoding, linear_from_encoded
+from osfcore.estimation.hypotheses import OUT_OF_VIEW, compare_orientations, side_hypotheses, yaw_hypotheses
 from osfcore.estimation.objective import (
     FINE_SIDE,
     LIGHT,
@@ -24,12 +35,10 @@ from osfcore.estimation.objective import (
     ObservedViews,
     SceneParameters,
     crop_to_masks,
-    photometric_loss,
-    residuals,
     views_of,
 )
+from osfcore.estimation.photometry import Calibration, Calibrator, adapted, check_table
 from osfcore.estimation.search import (
-    CMAES,
     OVERHEAD,
     SHIFT_M,
     TURN_RAD,
@@ -41,17 +50,25 @@ from osfcore.estimation.search import (
     initial_poses,
     rank_poses,
     search_light,
+    search_scene,
 )
-from osfcore.estimation.steps import EstimateStep, Stage
-from osfcore.estimation.uncertainty import estimate_with_uncertainty, evaluate_fit, relative_allowance
+from osfcore.estimation.steps import EstimateStep, Stage, all_but_last
+from osfcore.estimation.uncertainty import AMBIGUOUS, estimate_with_uncertainty, evaluate_fit, relative_allowance
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import Observation
+from osfcore.geometry.states import EstimatedState, Observation
+from osfcore.progress import Progress
 
 _COARSE_SIDE, _ROUGH_SIDE = FINE_SIDE // 2, FINE_SIDE // 4
 _LIGHT_RAD, _UNKNOWN_RAD = 0.03, 0.6  # the first spread of the light, where it was searched before and where not
 _HYPOTHESES = 3  # orientations of each object that the whole images choose from
 _RANKED_SHARP = 100
 _SHOWN = 24  # candidates of a ranking that are shown
+# Of unknown image models:
+_TINT = 0.1  # weight of the gains' spread over the colours: lamps are nearly white
+_LEAST_GAIN, _MOST_GAIN = 0.05, 20.0  # beyond, pictures show nothing, or nothing else
+_ROUNDS, _ITERATIONS = 3, 2  # of image model and poses in turn, at most; of Gauss-Newton in each
+_STILL_RAD = np.deg2rad(1.0)  # a lamp that moves less in a round has been found
+_SETTLED = 2e-4  # photometric loss; pictures decoded wrongly ended at 3e-4 and more
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,24 +102,66 @@ class FirstFrameConfig:
 def estimate_first(
     models: ObjectModels, observation: Observation, rng: np.random.Generator, config: FirstFrameConfig | None = None
 ) -> Iterator[EstimateStep]:
-    """Find all poses and the light; the last step holds the estimate.
+    """Find all poses and the light; the last step holds the estimate, and the image model of unusual pictures.
 
     Args:
         models: fields of the objects and the table.
-        observation: one or more views with masks.
+        observation: one or more views with masks, of any exposure, linear or sRGB.
         rng: of the searches.
-        config: how much work to do.
+        config: how much work to do; under a held light pictures are taken for usual ones.
 
     Raises:
         InvalidInput: without masks, or if an object's masks are all empty.
         UnknownName: if an object has no field.
     """
+    config = config or FirstFrameConfig()
     models.check(observation.names)
-    check_masks(observation)
+    _check_masks(observation)
+    can_adapt = models.can_change and config.held_light is None and len(observation.names) > 0
+    verdict = check_table(models, views_of(observation, FINE_SIDE)) if can_adapt else "usual"
+    if verdict == "usual":
+        yield from estimate_first_calibrated(models, observation, rng, config)
+        return
+    calibrator = Calibrator(models, observation.names)
+    if verdict == "unclear":
+        last = yield from all_but_last(estimate_first_calibrated(models, observation, rng, config))
+        if _is_settled(last):
+            yield last
+            return
+        assert last.estimate is not None
+        params = SceneParameters.of(last.estimate.state, observation.pusher)
+        views = views_of(observation, _COARSE_SIDE, samples=2)
+        if calibrator.refine(views, params, 1.0, hold_light=True).model.is_usual:
+            yield last
+            return
+    poses = _rough_poses(models, observation)
+    both = (_calibrated(calibrator, observation, poses, encoding) for encoding in get_args(Encoding))
+    found: list[EstimateStep] = []
+    for one in sorted((one for one in both if one.is_sane), key=lambda one: one.loss):
+        if found:  # and leaves much unexplained
+            yield replace(found[0], estimate=None)
+        found.append((yield from all_but_last(_estimate_with(models, calibrator, one, rng, config))))
+        if _is_settled(found[-1]):
+            break
+    if found:
+        yield min(found, key=lambda last: (not _is_settled(last), last.loss))
+    else:
+        yield from estimate_first_calibrated(models, observation, rng, config)
+
+
+def estimate_first_calibrated(
+    models: ObjectModels, observation: Observation, rng: np.random.Generator, config: FirstFrameConfig | None = None
+) -> Iterator[EstimateStep]:
+    """Find all poses and the light in pictures of the exposure, ambient light and table that fields were made for.
+
+    Arguments, steps and errors are those of `estimate_first`.
+    """
+    models.check(observation.names)
+    _check_masks(observation)
     yield from _FirstFrameEstimator(models, observation, rng, config or FirstFrameConfig()).steps()
 
 
-def check_masks(observation: Observation) -> None:
+def _check_masks(observation: Observation) -> None:
     """Refuse an observation that does not show where each object is.
 
     Raises:
@@ -135,8 +194,8 @@ class _FirstFrameEstimator:
         self._held = None if config.held_light is None else np.array(config.held_light)
 
     def steps(self) -> Iterator[EstimateStep]:
-        parts = [visible_part(self._coarse, n) for n in range(len(self._names))]
-        better = [visible_part(self._middle, n) for n in range(len(self._names))]
+        parts = [_visible_part(self._coarse, n) for n in range(len(self._names))]
+        better = [_visible_part(self._middle, n) for n in range(len(self._names))]
         starts: list[RankedPoses] = []
         for name, part in zip(self._names, parts, strict=True):
             starts.append(initial_poses(self._models, name, part))
@@ -159,16 +218,15 @@ class _FirstFrameEstimator:
         yield self._finish(at)
 
     def _rerank(self, n: int, starts: RankedPoses, light: np.ndarray) -> RankedPoses:
-        """Rank poses again under a known light, the best in full resolution, where labels tell sides apart."""
+        """Rank poses again under a known light, the best in full resolution, in which labels show."""
         for views, count in ((self._coarse, len(starts.losses)), (self._sharp, _RANKED_SHARP)):
-            part, best = visible_part(views, n), starts.best(count)
-            starts = rank_poses(self._models, self._names[n], part, best.positions, best.quaternions, light)
+            starts = rank_poses(self._models, self._names[n], _visible_part(views, n), starts.poses[:count], light)
         return starts
 
     def _search_each(
         self, parts: list[ObjectView], starts: list[RankedPoses], light: np.ndarray
     ) -> Iterator[EstimateStep]:  # returns the refined starts
-        """MultistartCMA of each object's pose by the masked loss (eq. 5), the light held."""
+        """Search each object's pose from its starts by CMA-ES on the masked loss (eq. 5), the light held."""
         population, brightness = self._config.population, self._held is None and self._config.light == "cma"
         searches = [
             MultistartCMA(
@@ -178,50 +236,40 @@ class _FirstFrameEstimator:
         ]
         for _ in range(self._config.generations):
             tried = [search.advance() for search in searches]
-            shown, losses = [t.candidates for t in tried], [t.loss for t in tried]
+            shown, losses = [poses for poses, _ in tried], [loss for _, loss in tried]
             best = self._initial_guess(starts, light)
-            sigma = tried[0].sigma if tried else 1.0
+            sigma = searches[0].sigma if searches else 1.0
             yield self._reporter.step("objects", "Each object in its masks", best, shown, losses, sigma)
         refined = []
         for n, (name, search) in enumerate(zip(self._names, searches, strict=True)):
-            part, ends = visible_part(self._fine, n), search.best_poses()
-            found = rank_poses(
-                self._models, name, part, ends.position, ends.quaternion, light, any_brightness=brightness
-            )
+            part, ends = _visible_part(self._fine, n), search.best_poses()
+            found = rank_poses(self._models, name, part, ends, light, any_brightness=brightness)
             refined.append(found.distinct(_HYPOTHESES))
         return refined
 
     def _search_jointly(self, params: SceneParameters) -> Iterator[EstimateStep]:  # returns the guess
-        """CMA-ES over all poses and the light by the photometric loss of whole images (eq. 6)."""
+        """Search all poses and the light by CMA-ES on the photometric loss of whole images (eq. 6)."""
         config = self._config
         spread = 0.0 if self._held is not None else {"search": _LIGHT_RAD, "cma": _UNKNOWN_RAD}[config.light]
         scales = np.array([*([SHIFT_M / 2] * 3 + [TURN_RAD / 2] * 3) * len(self._names), *[spread] * LIGHT])
-        search = CMAES(scales, config.joint_population, self._rng)
-        best, least = params, np.inf
-        for _ in range(config.joint_generations):
-            batch = params.perturbed(np.concatenate([np.zeros((1, params.size)), search.ask()]))
-            losses = photometric_loss(residuals(self._models, self._middle, batch))
-            search.tell(losses[1:])
-            k = int(np.argmin(losses))
-            if losses[k] < least:
-                least = float(losses[k])
-                found = batch.positions[k], batch.quaternions[k], batch.lights[k]
-                best = replace(params, positions=found[0], quaternions=found[1], light=found[2])
-            poses = [Pose(batch.positions[:, n], batch.quaternions[:, n]) for n in range(len(self._names))]
-            note = "All objects and the light"
-            yield self._reporter.step("together", note, best, poses, [], search.sigma, batch.lights, least)
-        return best
+        search = search_scene(
+            self._models, self._middle, params, scales,
+            population=config.joint_population, generations=config.joint_generations, rng=self._rng,
+        )  # fmt: skip
+        for found in search:
+            params, note = found.best, "All objects and the light"
+            yield self._reporter.step("together", note, params, found.tried, [], found.sigma, found.lights, found.loss)
+        return params
 
     def _refine(self, params: SceneParameters) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Gauss-Newton over all poses and the light, coarse to fine."""
+        """Refine all poses and the light by Gauss-Newton, coarse to fine."""
         config = self._config
         light = None if self._held is not None else self._middle
         at = GaussNewtonState.at(params)
         rounds = (self._middle, config.coarse_iterations), (self._fine, config.fine_iterations)
         for views, iterations in rounds:
-            for step in gauss_newton(self._models, views, at, iterations=iterations, light=light):
-                at = step
-                yield self._reporter.refinement("The last millimetres", at)
+            sweeps = gauss_newton(self._models, views, at, iterations=iterations, light=light)
+            at = yield from self._reporter.refinements("The last millimetres", at, sweeps)
         return at
 
     def _compare_orientations(
@@ -230,7 +278,7 @@ class _FirstFrameEstimator:
         """Replace each object's orientation by any hypothesis under which the whole images fit better."""
         for n, found in enumerate(starts):
             turned = (find(self._models, at.params, n) for find in (yaw_hypotheses, side_hypotheses))
-            others = Pose.joined(Pose(found.positions, found.quaternions), *turned)
+            others = Pose.joined(found.poses, *turned)
             at, self._rivals[n] = compare_orientations(
                 self._models, self._coarse, self._middle, self._fine, at, n, others
             )
@@ -246,21 +294,18 @@ class _FirstFrameEstimator:
 
     def _initial_guess(self, starts: list[RankedPoses], light: np.ndarray) -> SceneParameters:
         """The best of each object's poses; objects without any yet are put far below the table, out of view."""
-        count = len(self._names)
-        positions = np.tile([0.0, 0.0, -1.0], (count, 1))
-        quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
-        for n, found in enumerate(starts):
-            positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
-        return SceneParameters(self._names, positions, quaternions, light, self._pusher)
+        best = [found.poses[0] for found in starts]
+        poses = Pose.stacked(best + [OUT_OF_VIEW] * (len(self._names) - len(best)))
+        return SceneParameters(self._names, poses.position, poses.quaternion, light, self._pusher)
 
     def _ranking_step(self, stage: Stage, note: str, starts: list[RankedPoses], light: np.ndarray) -> EstimateStep:
         params = self._initial_guess(starts, light)
-        shown = [Pose(s.positions[:_SHOWN], s.quaternions[:_SHOWN]) for s in starts]
+        shown = [found.poses[:_SHOWN] for found in starts]
         return self._reporter.step(stage, note, params, shown, [float(s.losses[0]) for s in starts])
 
 
-def visible_part(views: ObservedViews, number: int) -> ObjectView:
-    """An object's part; where its masks are too thin for this resolution, their brightest pixel stands for them."""
+def _visible_part(views: ObservedViews, number: int) -> ObjectView:
+    """Cut out an object; where its masks are too thin for this resolution, their brightest pixel stands for them."""
     assert views.masks is not None
     own = views.masks[:, number]
     if own.max() > 0.5:
@@ -268,3 +313,102 @@ def visible_part(views: ObservedViews, number: int) -> ObjectView:
     masks = views.masks.copy()
     masks[:, number] = own / own.max()
     return crop_to_masks(replace(views, masks=masks), number)
+
+
+# Pictures of unknown exposure, encoding, ambient light and table.
+
+
+def _is_settled(last: EstimateStep) -> bool:
+    """Decide whether nothing speaks for another image model."""
+    return last.loss < _SETTLED and last.estimate is not None and last.estimate.trusted
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Calibrated:
+    """Pictures as a camera response makes them linear, and the image model that explains them."""
+
+    encoding: Encoding
+    observation: Observation
+    found: Calibration
+
+    @property
+    def loss(self) -> float:
+        return self.found.unexplained + _TINT * float(np.std(np.log(self.found.model.gain)))
+
+    @property
+    def is_sane(self) -> bool:
+        gain = self.found.model.gain
+        return bool(np.all((gain > _LEAST_GAIN) & (gain < _MOST_GAIN)))
+
+
+def _rough_poses(models: ObjectModels, observation: Observation) -> SceneParameters:
+    """Find the pose of each object that fits its masks best, at any brightness."""
+    coarse = views_of(observation, _COARSE_SIDE)
+    parts = ((name, _visible_part(coarse, n)) for n, name in enumerate(observation.names))
+    best = Pose.stacked(initial_poses(models, name, part).poses[0] for name, part in parts)
+    return SceneParameters(observation.names, best.position, best.quaternion, OVERHEAD, observation.pusher)
+
+
+def _calibrated(
+    calibrator: Calibrator, observation: Observation, params: SceneParameters, encoding: Encoding
+) -> _Calibrated:
+    """Fit the image model of pictures in an encoding to rough poses."""
+    images = linear_from_encoded(observation.images, encoding).astype(np.float32)
+    linear = replace(observation, images=images)
+    found = calibrator.search(views_of(linear, _ROUGH_SIDE), views_of(linear, _COARSE_SIDE), params)
+    return _Calibrated(encoding, linear, found)
+
+
+def _estimate_with(
+    models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, rng: np.random.Generator, config: FirstFrameConfig
+) -> Iterator[EstimateStep]:
+    """Run the usual method on pictures and models that agree, then refine both."""
+    model, linear, more = rough.found.model, rough.observation, (_ROUNDS + 1) * _ITERATIONS
+    usual = estimate_first_calibrated(adapted(models, linear.names, model), model.normalized(linear), rng, config)
+    before = next(usual)
+    for step in usual:
+        progress = before.progress
+        yield replace(before, progress=Progress(progress.done, progress.total + more, progress.note))
+        before = step
+    assert before.estimate is not None
+    reporter = StepReporter(before.progress.total + more)
+    reporter.done = before.progress.total - 1
+    yield from _refine_with_image_model(models, calibrator, rough, before.estimate, reporter)
+
+
+def _refine_with_image_model(
+    models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, estimate: EstimatedState, reporter: StepReporter
+) -> Iterator[EstimateStep]:
+    """Fit image model, poses and lamp in turn, until the lamp stands still.
+
+    The image model is searched for once more first: the one that rough poses have led to may be far off.
+    """
+    linear = rough.observation
+    at = GaussNewtonState.at(SceneParameters.of(estimate.state, linear.pusher))
+    small, middle, fine = (views_of(linear, side, samples=2) for side in (_ROUGH_SIDE, _COARSE_SIDE, FINE_SIDE))
+    found = calibrator.search(small, middle, at.params)
+    for _ in range(_ROUNDS):
+        before = at.params.light
+        at = yield from _refine_poses_and_lamp(models, linear, found, at, reporter)
+        if at.params.light @ before > np.cos(_STILL_RAD):
+            break
+        found = calibrator.refine(fine, at.params, found.model.ambient, hold_light=False)
+    found = calibrator.refine(fine, at.params, found.model.ambient, hold_light=True)
+    at = yield from _refine_poses_and_lamp(models, linear, found, at, reporter)
+    model = replace(found.model, encoding=rough.encoding)
+    sharp = views_of(found.model.normalized(linear), FINE_SIDE, samples=2)
+    fit = evaluate_fit(adapted(models, linear.names, model), sharp, at.params)
+    rivals = {n: 1.0 for n, doubt in enumerate(estimate.doubts) if doubt == AMBIGUOUS}
+    sure = estimate_with_uncertainty(at.params, at.normals, fit, rivals, allowed=relative_allowance(fit))
+    yield replace(reporter.finish(at, sure), image_model=model)
+
+
+def _refine_poses_and_lamp(
+    models: ObjectModels, linear: Observation, found: Calibration, at: GaussNewtonState, reporter: StepReporter
+) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+    """Refine poses and lamp by Gauss-Newton, with models and pictures made to agree by a calibration."""
+    fitting, normal = adapted(models, linear.names, found.model), found.model.normalized(linear)
+    sharp, soft = (views_of(normal, side, samples=2) for side in (FINE_SIDE, _COARSE_SIDE))
+    at = GaussNewtonState.at(replace(at.params, light=found.light))
+    sweeps = gauss_newton(fitting, sharp, at, iterations=_ITERATIONS, light=soft)
+    return (yield from reporter.refinements("Exposure and table", at, sweeps))

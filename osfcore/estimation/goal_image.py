@@ -1,9 +1,9 @@
 """Goal images: one view, no masks, objects known by name, perhaps under another light than the scene.
 
 First the scene as it is now is compared with the image: objects that it shows there stay, and templates of the others
-are matched over the image (`template_matching`), in the resting orientation that they have now, since goals are mostly
-reached by pushing. Where that leaves doubts, templates of all objects are matched, combinations of matches are ranked
-by their photometric loss under any light (`scene_assembly`), and what is still doubted in other orientations.
+are matched over the image, in the resting orientation that they have now, since goals are mostly reached by pushing.
+Where that leaves doubts, templates of all objects are matched, combinations of matches are ranked by their photometric
+loss under any light, and what is still doubted is matched in other orientations (all in `hypotheses.py`).
 Gauss-Newton refines as in the first frame.
 """
 
@@ -17,9 +17,8 @@ from jaxtyping import Float
 
 from osfcore.errors import InvalidInput
 from osfcore.estimation.hypotheses import (
-    OUT_OF_VIEW,
+    SceneAssembly,
     TemplateMatches,
-    assemble_scene,
     compare_orientations,
     count_of_scenes,
     match_templates,
@@ -28,7 +27,7 @@ from osfcore.estimation.hypotheses import (
     without_objects,
     yaw_hypotheses,
 )
-from osfcore.estimation.objective import FINE_SIDE, ObjectModels, SceneParameters, loss_of, views_of, yaw_quaternions
+from osfcore.estimation.objective import FINE_SIDE, ObjectModels, SceneParameters, full_circle, loss_of, views_of
 from osfcore.estimation.search import PLANAR_PARAMETERS, GaussNewtonState, StepReporter, gauss_newton, search_light
 from osfcore.estimation.steps import EstimateStep, Stage
 from osfcore.estimation.uncertainty import (
@@ -38,12 +37,14 @@ from osfcore.estimation.uncertainty import (
     goal_allowance,
     misfits,
 )
-from osfcore.geometry.poses import Pose, quaternion_multiply, rotate, rotation_angle
+from osfcore.geometry.poses import Pose, quaternion_multiply, rotation_angle
 from osfcore.geometry.states import EstimatedState, Observation, SceneState
 
-# Refinement of one guess of a goal image by Gauss-Newton, with the comparison of orientations.
-
-
+_YAWS = 24
+_MATCHES = 300
+_SHOWN = 24
+_BETTER = 0.98  # times the loss: what is less is no reason to look elsewhere
+_ROUNDS = 2  # in which doubted objects are put where they were seen: the first may stand in the second's place
 _FINE_PLANAR = 2  # iterations on fine images while objects stay flat on the table
 _COMPARISONS, _TURNED_RAD = 2, np.deg2rad(30.0)
 _BESIDE_M = 0.04
@@ -66,115 +67,6 @@ class GoalImageConfig:
     free_iterations: int = 8
     widen_all: bool = False
     held_light: tuple[float, float, float] | None = None
-
-
-class GoalRefinement:
-    """Refines guesses of one image.
-
-    Args:
-        models: fields of the objects and the table.
-        observation: one view.
-        config: how much work to do.
-        usual: by object, what is usual for its residual, see `goal_allowance`; what is left out is not known.
-    """
-
-    def __init__(
-        self, models: ObjectModels, observation: Observation, config: GoalImageConfig, usual: Mapping[str, float]
-    ) -> None:
-        self.models = models
-        self.fine = views_of(observation, FINE_SIDE, samples=2)
-        self.middle = views_of(observation, FINE_SIDE // 2, samples=2)
-        self.rivals: dict[int, float] = {}
-        self._usual = np.array([usual.get(name, np.nan) for name in observation.names])
-        self._names, self._config = observation.names, config
-        self._is_held = config.held_light is not None
-        self._light_views = None if self._is_held else self.middle  # in which the light is refined
-
-    @property
-    def steps(self) -> int:
-        """How many a refinement may take."""
-        comparison = len(self._names) + self._config.free_iterations
-        return self._config.planar_iterations + _FINE_PLANAR + _COMPARISONS * comparison
-
-    def refined(
-        self, params: SceneParameters, matches: Sequence[TemplateMatches], moved: Sequence[int], reporter: StepReporter
-    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Gauss-Newton over positions and yaw on the table, then over whole poses; returns where it ended.
-
-        Args:
-            params: the guess.
-            matches: of each object; those nearby are compared.
-            moved: numbers of the objects whose places and orientations are in question; the others are only refined.
-            reporter: of the steps.
-        """
-        at = GaussNewtonState.at(params)
-        for views, numbers, iterations in (
-            (self.middle, PLANAR_PARAMETERS, self._config.planar_iterations),
-            (self.fine, PLANAR_PARAMETERS, _FINE_PLANAR),
-        ):
-            for step in gauss_newton(
-                self.models, views, at, iterations=iterations, objects=moved, numbers=numbers, light=self._light_views
-            ):
-                at = step
-                yield reporter.refinement("On the table", at)
-        for _ in range(_COMPARISONS):
-            before = at.params.quaternions
-            at = yield from self._compare_orientations(at, matches, moved, reporter)
-            if rotation_angle(before, at.params.quaternions).max() < _TURNED_RAD:
-                break  # no object was turned, so the others' losses have not changed
-        return at
-
-    def _compare_orientations(
-        self, at: GaussNewtonState, matches: Sequence[TemplateMatches], moved: Sequence[int], reporter: StepReporter
-    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Replace each object's orientation by any hypothesis of lower loss, then refine all six degrees of freedom.
-
-        A wrong orientation also shifts the position, so matches nearby are tried as well.
-        """
-        for n in moved:
-            beside = matches[n].within(at.params.positions[n], _BESIDE_M)
-            others = Pose.joined(yaw_hypotheses(self.models, at.params, n), beside.poses)
-            at, self.rivals[n] = compare_orientations(self.models, self.middle, self.fine, self.fine, at, n, others)
-            yield reporter.refinement(f"{self._names[n]}: the other way round", at)
-        at = replace(at, dampings=GaussNewtonState.at(at.params).dampings)
-        sweeps = self._config.free_iterations
-        for step in gauss_newton(
-            self.models, self.fine, at, iterations=sweeps, light=self._light_views, until_settled=True
-        ):
-            at = step
-            yield reporter.refinement("The last millimetres", at)
-        return at
-
-    def doubted(self, at: GaussNewtonState) -> list[int]:
-        """Numbers of the objects whose fit is poor, or whose pose the image does not determine."""
-        sure = {n: ratio for n, ratio in self.rivals.items() if ratio >= SURE_RIVAL_RATIO}
-        return [n for n, doubt in enumerate(self.estimate(at, sure).doubts) if doubt]
-
-    def misfits(self, params: SceneParameters) -> list[int]:
-        """Numbers of the objects that the image does not show where a guess has them."""
-        fit = evaluate_fit(self.models, self.fine, params)
-        return misfits(fit, goal_allowance(fit, self._usual))
-
-    def estimate(self, at: GaussNewtonState, rivals: Mapping[int, float]) -> EstimatedState:
-        """The estimate with its uncertainty; heights are checked, since one view hardly shows depth.
-
-        Args:
-            at: where Gauss-Newton ended.
-            rivals: by object, the best loss of a different orientation over the loss of the one chosen.
-        """
-        fit, poses = evaluate_fit(self.models, self.fine, at.params), at.params.state().poses
-        lowest = np.array([self.models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
-        allowed = goal_allowance(fit, self._usual)
-        return estimate_with_uncertainty(
-            at.params, at.normals, fit, rivals, lowest=lowest, light_held=self._is_held, allowed=allowed
-        )
-
-
-_YAWS = 24
-_MATCHES = 300
-_SHOWN = 24
-_BETTER = 0.98  # times the loss: what is less is no reason to look elsewhere
-_ROUNDS = 2  # in which doubted objects are put where they were seen: the first may stand in the second's place
 
 
 def estimate_goal(
@@ -216,30 +108,37 @@ class _GoalImageEstimator:
         config: GoalImageConfig,
         shares: Mapping[str, float],
     ) -> None:
-        self._refinement = GoalRefinement(models, observation, config, shares)
         self._models, self._config, self._prior = models, config, prior
         self._names = observation.names
         self._everything = range(len(observation.names))
+        self._usual = np.array([shares.get(name, np.nan) for name in self._names])
+        self._fine = views_of(observation, FINE_SIDE, samples=2)
+        self._middle = views_of(observation, FINE_SIDE // 2, samples=2)
         self._coarse = views_of(observation, FINE_SIDE // 2)
         self._rough = views_of(observation, FINE_SIDE // 4)
         self._slide = views_of(observation, config.side)
-        self._pass = count_of_scenes(len(self._names)) + self._refinement.steps
-        self._reporter = StepReporter(len(self._names) + _ROUNDS + self._refinement.steps + 1)
+        self._is_held = config.held_light is not None
+        self._light_views = None if self._is_held else self._middle  # in which the light is refined
+        self._rivals: dict[int, float] = {}
+        comparison = len(self._names) + config.free_iterations
+        self._most_refinements = config.planar_iterations + _FINE_PLANAR + _COMPARISONS * comparison
+        self._pass = count_of_scenes(len(self._names)) + self._most_refinements
+        self._reporter = StepReporter(len(self._names) + _ROUNDS + self._most_refinements + 1)
 
     def steps(self) -> Iterator[EstimateStep]:
         at = yield from self._from_prior()
         if self._doubtful_objects(at):
-            rivals = self._refinement.rivals
+            rivals = self._rivals
             other = yield from self._from_anywhere()
             at = self._better_of(at, other, rivals)
-        yield self._reporter.finish(at, self._refinement.estimate(at, self._refinement.rivals))
+        yield self._reporter.finish(at, self._estimate(at, self._rivals))
 
     def _from_prior(self) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """What the image shows where the prior has it stays; templates of the others alone are matched."""
+        """Keep what the image shows where the prior has it; match templates of the others alone."""
         params = self._relit(self._prior_guess())
-        bad = self._refinement.misfits(params)
-        none = TemplateMatches(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))
-        matches = [none] * len(self._names)
+        fit = evaluate_fit(self._models, self._fine, params)
+        bad = misfits(fit, goal_allowance(fit, self._usual))
+        matches = [TemplateMatches.none()] * len(self._names)
         params = without_objects(params, bad)
         behind = scene_errors(self._models, self._slide, params)
         for n in bad:
@@ -252,9 +151,9 @@ class _GoalImageEstimator:
         return (yield from self._reassign(at, matches, bad))
 
     def _from_anywhere(self) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Templates of all objects are matched, and scenes assembled under any light."""
+        """Match templates of all objects, and assemble scenes under any light."""
         self._reporter.total += len(self._names) + self._pass
-        self._refinement.rivals = {}
+        self._rivals = {}
         matches: list[TemplateMatches] = []
         for n, name in enumerate(self._names):
             matches.append(self._match_prior_orientation(n))
@@ -277,15 +176,18 @@ class _GoalImageEstimator:
         return SceneParameters(self._names, poses.position, poses.quaternion, light, None)
 
     def _relit(self, params: SceneParameters) -> SceneParameters:
-        """Under the light that fits best, if that fits better than the guess's."""
-        if self._config.held_light is not None:
+        """Put the guess under the light that fits best, if that fits better than its own."""
+        if self._is_held:
             return params
         other = replace(params, light=search_light(self._models, self._rough, self._coarse, params))
         return min(params, other, key=lambda one: loss_of(self._models, self._coarse, one))
 
     def _doubtful_objects(self, at: GaussNewtonState) -> list[int]:
-        """Objects whose fit is poor or whose orientation the image does not determine."""
-        return list(self._everything) if self._config.widen_all else self._refinement.doubted(at)
+        """Return numbers of objects whose fit is poor, or whose pose the image does not determine."""
+        if self._config.widen_all:
+            return list(self._everything)
+        sure = {n: ratio for n, ratio in self._rivals.items() if ratio >= SURE_RIVAL_RATIO}
+        return [n for n, doubt in enumerate(self._estimate(at, sure).doubts) if doubt]
 
     def _relocate_doubtful(
         self, at: GaussNewtonState, bad: list[int], matches: list[TemplateMatches]
@@ -294,7 +196,7 @@ class _GoalImageEstimator:
 
         Under the estimated light the table's brightness is known, so grey objects differ from its shadows.
         """
-        self._reporter.total += len(bad) + 1 + self._refinement.steps
+        self._reporter.total += len(bad) + 1 + self._most_refinements
         params = without_objects(at.params, bad)
         behind = scene_errors(self._models, self._slide, params)
         for n in bad:
@@ -323,56 +225,108 @@ class _GoalImageEstimator:
         self, at: GaussNewtonState, params: SceneParameters, matches: list[TemplateMatches], moved: Sequence[int]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Refine another guess; keep the result if its loss is lower."""
-        rivals = dict(self._refinement.rivals)
+        rivals = dict(self._rivals)
         other = yield from self._refined(params, matches, moved)
         return self._better_of(at, other, rivals)
 
     def _better_of(self, at: GaussNewtonState, other: GaussNewtonState, rivals: dict[int, float]) -> GaussNewtonState:
         """The one whose loss is lower; of two that cost the same the first, with its own rivals."""
-        here, there = (loss_of(self._models, self._refinement.fine, one.params) for one in (at, other))
+        here, there = (loss_of(self._models, self._fine, one.params) for one in (at, other))
         if there < here:
             return other
-        self._refinement.rivals = rivals
+        self._rivals = rivals
         return at
 
     def _refined(
         self, params: SceneParameters, matches: list[TemplateMatches], moved: Sequence[int]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        return (yield from self._refinement.refined(params, matches, moved, self._reporter))
+        """Refine positions and yaw on the table, then whole poses, by Gauss-Newton.
+
+        Args:
+            params: the guess.
+            matches: of each object; those nearby are compared.
+            moved: numbers of the objects whose places and orientations are in question; the others are only refined.
+        """
+        at, note = GaussNewtonState.at(params), "On the table"
+        for views, iterations in (self._middle, self._config.planar_iterations), (self._fine, _FINE_PLANAR):
+            sweeps = gauss_newton(
+                self._models, views, at,
+                iterations=iterations, objects=moved, numbers=PLANAR_PARAMETERS, light=self._light_views,
+            )  # fmt: skip
+            at = yield from self._reporter.refinements(note, at, sweeps)
+        for _ in range(_COMPARISONS):
+            before = at.params.quaternions
+            at = yield from self._compare_orientations(at, matches, moved)
+            if rotation_angle(before, at.params.quaternions).max() < _TURNED_RAD:
+                break  # no object was turned, so the others' losses have not changed
+        return at
+
+    def _compare_orientations(
+        self, at: GaussNewtonState, matches: list[TemplateMatches], moved: Sequence[int]
+    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
+        """Replace each object's orientation by any hypothesis of lower loss, then refine all six degrees of freedom.
+
+        A wrong orientation also shifts the position, so matches nearby are tried as well.
+        """
+        for n in moved:
+            poses = matches[n].poses
+            beside = poses[np.linalg.norm(poses.position - at.params.positions[n], axis=1) < _BESIDE_M]
+            others = Pose.joined(yaw_hypotheses(self._models, at.params, n), beside)
+            at, self._rivals[n] = compare_orientations(
+                self._models, self._middle, self._fine, self._fine, at, n, others
+            )
+            yield self._reporter.refinement(f"{self._names[n]}: the other way round", at)
+        at, work = at.undamped(), self._config.free_iterations
+        sweeps = gauss_newton(
+            self._models, self._fine, at, iterations=work, light=self._light_views, until_settled=True
+        )
+        return (yield from self._reporter.refinements("The last millimetres", at, sweeps))
+
+    def _estimate(self, at: GaussNewtonState, rivals: Mapping[int, float]) -> EstimatedState:
+        """Return the estimate with its uncertainty; heights are checked, since one view hardly shows depth.
+
+        Args:
+            at: where Gauss-Newton ended.
+            rivals: by object, the best loss of a different orientation over the loss of the one chosen.
+        """
+        fit, poses = evaluate_fit(self._models, self._fine, at.params), at.params.state().poses
+        lowest = np.array([self._models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
+        allowed = goal_allowance(fit, self._usual)
+        return estimate_with_uncertainty(
+            at.params, at.normals, fit, rivals, lowest=lowest, light_held=self._is_held, allowed=allowed
+        )
 
     def _match_prior_orientation(
         self, n: int, behind: Float[np.ndarray, "h w"] | None = None, light: Float[np.ndarray, "3"] | None = None
     ) -> TemplateMatches:
         pose = self._prior.pose(self._names[n])
-        turns = yaw_quaternions(np.arange(_YAWS) * 2 * np.pi / _YAWS)
-        quaternions = quaternion_multiply(turns, pose.quaternion[None])
+        quaternions = quaternion_multiply(full_circle(_YAWS), pose.quaternion[None])
         heights = np.full(_YAWS, pose.position[2])
         return match_templates(
             self._models, self._slide, self._names[n], quaternions, heights, most=_MATCHES, behind=behind, light=light
         )
 
     def _match_any_orientation(self, n: int, behind: Float[np.ndarray, "h w"]) -> TemplateMatches:
-        resting = self._models.resting(self._names[n])
-        heights = resting.heights - rotate(resting.quaternions, resting.centre)[:, 2]
+        name, resting = self._names[n], self._models.resting(self._names[n])
         return match_templates(
-            self._models, self._coarse, self._names[n], resting.quaternions, heights, most=2 * _MATCHES, behind=behind
-        )
+            self._models, self._coarse, name, resting.quaternions, resting.origin_heights,
+            most=2 * _MATCHES, behind=behind,
+        )  # fmt: skip
 
     def _initial_guess(self, matches: list[TemplateMatches]) -> SceneParameters:
         """The best match of each object; objects without one are out of view."""
-        count = len(self._names)
-        positions, quaternions = np.tile(OUT_OF_VIEW.position, (count, 1)), np.tile(OUT_OF_VIEW.quaternion, (count, 1))
+        params = without_objects(self._prior_guess(), self._everything)
         for n, found in enumerate(matches):
             if len(found.scores):
-                positions[n], quaternions[n] = found.positions[0], found.quaternions[0]
-        return replace(self._prior_guess(), positions=positions, quaternions=quaternions)
+                params = params.with_pose(n, found.poses[0])
+        return params
 
     def _assemble(
         self, params: SceneParameters, matches: list[TemplateMatches]
     ) -> Iterator[EstimateStep]:  # returns the guess
-        """The combination of matches with the lowest photometric loss."""
-        for step in assemble_scene(self._models, self._rough, self._coarse, params, matches):
-            params, loss = step
+        """Find the combination of matches with the lowest photometric loss."""
+        for best, loss in SceneAssembly(self._models, self._rough, self._coarse, matches).scenes(params):
+            params = best
             yield self._step("together", "Which matches explain the image together", params, matches, loss=loss)
         return params
 
@@ -387,7 +341,7 @@ class _GoalImageEstimator:
         here, there = (loss_of(self._models, self._coarse, one) for one in (at.params, params))
         if there > _BETTER * here:
             return at
-        self._reporter.total += 1 + self._refinement.steps
+        self._reporter.total += 1 + self._most_refinements
         yield self._step("together", "Objects seen elsewhere", params, matches)
         return (yield from self._accept_if_better(at, params, matches, moved))
 

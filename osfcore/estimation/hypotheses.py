@@ -16,23 +16,25 @@ from osfcore.estimation.objective import (
     SceneParameters,
     crop_camera,
     crop_to_object,
+    empty_scene,
+    full_circle,
     loss_of,
-    photometric_loss,
-    residuals,
+    pose_losses,
     yaw_quaternions,
 )
-from osfcore.estimation.search import GaussNewtonState, gauss_newton, hemisphere, lit_table_level, search_light
+from osfcore.estimation.search import (
+    OVERHEAD,
+    GaussNewtonState,
+    distinct_orientations,
+    gauss_newton,
+    hemisphere,
+    lit_table_level,
+    search_light,
+)
 from osfcore.estimation.uncertainty import evaluate_fit, object_residuals
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE
-from osfcore.geometry.poses import (
-    Pose,
-    quaternion_conjugate,
-    quaternion_exp,
-    quaternion_multiply,
-    rotate,
-    rotation_angle,
-)
+from osfcore.geometry.poses import Pose, quaternion_conjugate, quaternion_exp, quaternion_multiply, rotate
 from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.render.types import SceneBatch
 
@@ -45,10 +47,7 @@ _RANKED_COARSE = 64  # hypotheses that are ranked again in coarse images
 _REFINED_ROUGH = 8  # of these, so many that differ are refined in rough images
 _REFINED_COARSE = 3  # of these, so many are refined in coarse ones
 _ITERATIONS, _FINE_ITERATIONS = 2, 3
-_FAR, _EXPLAINED = (
-    1.5,
-    0.035,
-)  # nothing is refined where all losses are as high and the object differs by less [radiance]
+_FAR, _EXPLAINED = 1.5, 0.035  # nothing is refined where all losses are as high and it differs by less [radiance]
 _CLOSE = 1.5  # ratio to the present loss up to which a hypothesis is refined on fine images
 _BETTER = 0.98  # times the loss: what is less is no reason to turn an object
 _SAME_RAD = np.deg2rad(12.0)
@@ -62,11 +61,8 @@ def yaw_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -
         params: the guess; the object's own pose is not among the result.
         number: of the object.
     """
-    turns = yaw_quaternions(np.arange(1, _YAWS) * 2 * np.pi / _YAWS)
-    quaternions = quaternion_multiply(turns, params.quaternions[number][None])
-    centre = models.resting(params.names[number]).centre
-    middle = params.positions[number] + rotate(params.quaternions[number], centre)
-    return Pose(middle - rotate(quaternions, centre), quaternions)
+    quaternions = quaternion_multiply(full_circle(_YAWS)[1:], params.quaternions[number][None])
+    return models.resting(params.names[number]).poses_at(models.centre_of_mass(params, number), quaternions)
 
 
 def side_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
@@ -92,9 +88,9 @@ def side_hypotheses(models: ObjectModels, params: SceneParameters, number: int) 
     turns = axes[other] / np.linalg.norm(axes[other], axis=1, keepdims=True).clip(1e-9) * angles[other, None]
     tipped = quaternion_multiply(quaternion_exp(turns), own[None])
     quaternions = np.concatenate([tipped, quaternion_multiply(yaw_quaternions(np.array([np.pi])), tipped)])
-    middle = np.tile(params.positions[number] + rotate(own, resting.centre), (len(quaternions), 1))
+    middle = np.tile(models.centre_of_mass(params, number), (len(quaternions), 1))
     middle[:, 2] = np.tile(resting.heights[first][other], 2)
-    return Pose(middle - rotate(quaternions, resting.centre), quaternions)
+    return resting.poses_at(middle, quaternions)
 
 
 def compare_orientations(
@@ -134,13 +130,14 @@ def compare_orientations(
     far, nearest = far[np.argsort(losses)], float(losses.min() / max(loss_of(models, own, at.params), 1e-12))
     if nearest > _FAR and object_residuals(evaluate_fit(models, fine, at.params))[number] < _EXPLAINED:
         return at, nearest
-    tried = [_refine(models, rough, at, number, far[k], _ITERATIONS) for k in _distinct_orientations(far)]
+    begun = distinct_orientations(far.quaternion, _REFINED_ROUGH, _SAME_RAD * 1.5)
+    tried = [_refine(models, rough, at, number, far[k], _ITERATIONS) for k in begun]
     tried = sorted(tried, key=lambda one: loss_of(models, own, one.params))[:_REFINED_COARSE]
-    tried = [_refine(models, coarse, one, number, _pose(one.params, number), _ITERATIONS) for one in tried]
+    tried = [_refine(models, coarse, one, number, one.params.pose(number), _ITERATIONS) for one in tried]
     ends = [loss_of(models, own, refined.params) for refined in tried]
     rival = tried[int(np.argmin(ends))]
     if min(ends) < _CLOSE * loss_of(models, own, at.params):
-        rival = _refine(models, fine, rival, number, _pose(rival.params, number), _FINE_ITERATIONS)
+        rival = _refine(models, fine, rival, number, rival.params.pose(number), _FINE_ITERATIONS)
     own = crop_to_object(fine, models, at.params, number)
     here, there = (loss_of(models, own, params) for params in (at.params, rival.params))
     angle = models.turned(name, own_quaternion, rival.params.quaternions[number][None])[0]
@@ -151,55 +148,9 @@ def compare_orientations(
 def _refine(
     models: ObjectModels, views: ObservedViews, at: GaussNewtonState, number: int, pose: Pose, iterations: int
 ) -> GaussNewtonState:
-    """Gauss-Newton of one object from a pose; its normal matrix stays that of before until it moves."""
-    rival = replace(at, params=with_pose(at.params, number, pose), dampings=GaussNewtonState.at(at.params).dampings)
+    """Refine one object from a pose by Gauss-Newton; its normal matrix stays that of before until it moves."""
+    rival = replace(at.undamped(), params=at.params.with_pose(number, pose))
     return list(gauss_newton(models, views, rival, iterations=iterations, objects=(number,)))[-1]
-
-
-def _distinct_orientations(poses: Pose) -> list[int]:
-    """Indices of the first few poses that differ from each other."""
-    kept: list[int] = []
-    for k in range(len(poses.position)):
-        if all(rotation_angle(poses.quaternion[k], poses.quaternion[o]) > _SAME_RAD * 1.5 for o in kept):
-            kept.append(k)
-        if len(kept) == _REFINED_ROUGH:
-            break
-    return kept
-
-
-def with_pose(params: SceneParameters, number: int, pose: Pose) -> SceneParameters:
-    """A guess with one object in another pose.
-
-    Args:
-        params: the guess, which stays as it is.
-        number: of the object.
-        pose: its new `T_world_object`.
-    """
-    positions, quaternions = params.positions.copy(), params.quaternions.copy()
-    positions[number], quaternions[number] = pose.position, pose.quaternion
-    return replace(params, positions=positions, quaternions=quaternions)
-
-
-def _pose(params: SceneParameters, number: int) -> Pose:
-    return Pose(params.positions[number], params.quaternions[number])
-
-
-def pose_losses(
-    models: ObjectModels, views: ObservedViews, params: SceneParameters, number: int, poses: Pose
-) -> Float[np.ndarray, "K"]:
-    """Photometric loss of a scene with one object in each of K poses.
-
-    Args:
-        models: fields.
-        views: images to compare with, whole ones or windows around the object.
-        params: the guess; all other objects and the light stay.
-        number: of the object.
-        poses: the K poses, a batch of `T_world_object`.
-    """
-    batch = params.perturbed(np.zeros((len(poses.position), params.size)))
-    positions, quaternions = batch.positions.copy(), batch.quaternions.copy()
-    positions[:, number], quaternions[:, number] = poses.position, poses.quaternion
-    return photometric_loss(residuals(models, views, replace(batch, positions=positions, quaternions=quaternions)))
 
 
 # Finding an object in one image without a mask: templates slid over the image, under every light at once.
@@ -224,31 +175,17 @@ class TemplateMatches:
     """Where an object may be in an image, the most likely first.
 
     Attributes:
-        positions: of the object's origin [m].
-        quaternions: unit.
+        poses: K poses `T_world_object`.
         scores: by how much each explains its pixels better than the table does.
     """
 
-    positions: Float[np.ndarray, "K 3"]
-    quaternions: Float[np.ndarray, "K 4"]
+    poses: Pose
     scores: Float[np.ndarray, "K"]
 
-    @property
-    def poses(self) -> Pose:
-        """All of them."""
-        return Pose(self.positions, self.quaternions)
-
-    def pose(self, number: int) -> Pose:
-        """One of them."""
-        return Pose(self.positions[number], self.quaternions[number])
-
-    def within(self, position: Float[np.ndarray, "3"], reach: float) -> TemplateMatches:
-        """Those within `reach` [m] of a position."""
-        return self.subset(np.flatnonzero(np.linalg.norm(self.positions - position, axis=1) < reach))
-
-    def subset(self, numbers: Int[np.ndarray, "C"]) -> TemplateMatches:
-        """Some of them."""
-        return TemplateMatches(self.positions[numbers], self.quaternions[numbers], self.scores[numbers])
+    @staticmethod
+    def none() -> TemplateMatches:
+        """Matches of an object that was not found."""
+        return TemplateMatches(Pose.identity(0), np.zeros(0))
 
 
 def table_errors(models: ObjectModels, views: ObservedViews, lit: float | None = None) -> Float[np.ndarray, "h w"]:
@@ -260,9 +197,7 @@ def table_errors(models: ObjectModels, views: ObservedViews, lit: float | None =
         lit: light on the lit table, see `lit_table_level`: then each pixel shows that, or shadow. Else it is lit or
             shaded at will, and grey objects pass for table, too.
     """
-    view = views.cameras[:1]
-    nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), _BASIS[:1], None)
-    table = models.together.render(nothing, view, quality=QUALITY).rgb[0, 0]
+    table = models.together.render(empty_scene(OVERHEAD), views.cameras[:1], quality=QUALITY).rgb[0, 0]
     image = views.images[0]
     share = (image * table).sum(axis=-1) / np.maximum((table * table).sum(axis=-1), 1e-6)
     errors = np.full(share.shape, _MAX_TABLE_ERROR**2)
@@ -281,7 +216,7 @@ def scene_errors(models: ObjectModels, views: ObservedViews, params: SceneParame
         views: what was observed; only the first view counts.
         params: the scene to render, such as the objects found so far.
     """
-    rendered = models.together.render(params.perturbed(np.zeros((1, params.size))), views.cameras[:1], quality=QUALITY)
+    rendered = models.together.render(params.repeated(), views.cameras[:1], quality=QUALITY)
     return np.minimum(((views.images[0] - rendered.rgb[0, 0]) ** 2).sum(axis=-1), _MAX_TABLE_ERROR**2)
 
 
@@ -311,28 +246,26 @@ def match_templates(
     lights = _BASIS if light is None else light[None]
     camera, image = views.cameras[0], views.images[0]
     table = table_errors(models, views, lit_table_level(models, views)) if behind is None else behind
+    pixels = np.concatenate([image, table[..., None]], axis=-1)
     grid = np.linspace(-1, 1, 2 * _ANCHORS + 1)[1::2] * _REACH_M
     found = [
-        _match_at_anchor(models, camera, image, table, name, quaternions, heights, lights, (x, y))
-        for x in grid
-        for y in grid
+        _match_at_anchor(models, camera, pixels, name, quaternions, heights, lights, (x, y)) for x in grid for y in grid
     ]
     positions, turns, scores = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return _non_maximum_suppression(positions, turns, scores, most)
+    return _non_maximum_suppression(Pose(positions, turns), scores, most)
 
 
 def _match_at_anchor(
     models: ObjectModels,
     camera: Camera,
-    image: np.ndarray,
-    table: np.ndarray,
+    pixels: np.ndarray,
     name: str,
     quaternions: np.ndarray,
     heights: np.ndarray,
     lights: np.ndarray,
     anchor: tuple[float, float],
 ) -> tuple[np.ndarray, ...]:
-    """The best places of each orientation around an anchor: positions, orientations, scores."""
+    """Find the best places of each orientation around an anchor: positions, orientations, scores."""
     resting = models.resting(name)
     positions = np.column_stack([np.tile(anchor, (len(heights), 1)), heights])
     centre = positions[0] + rotate(quaternions[0], resting.centre)
@@ -340,22 +273,20 @@ def _match_at_anchor(
     depth = float(camera.T_world_camera.inverse().apply(centre)[2])
     if depth < resting.radius:
         return nothing  # behind the camera, or around it
-    height, width = image.shape[:2]
+    height, width = pixels.shape[:2]
     per_metre = camera.intrinsics[0, 0] / depth
     half = int(np.clip(np.ceil(1.15 * resting.radius * per_metre) + 1, 8, min(height, width) // 2))
     shift = min(int(np.ceil(_REACH_M / _ANCHORS * per_metre)) + 1, max(height, width) // 2)
     x, y = (int(v) for v in np.round(camera.project(centre)) - half)
     if not (-2 * half < x < width and -2 * half < y < height):
         return nothing  # the camera does not look there
-    patches, places = _patches(np.concatenate([image, table[..., None]], axis=-1), x, y, 2 * half, shift)
-    scores = _scores(
-        models, crop_camera(camera, x, y, 2 * half, 2 * half), name, positions, quaternions, lights, patches
-    )
+    patches, places = _patches(pixels, x, y, 2 * half, shift)
+    window = crop_camera(camera, x, y, 2 * half, 2 * half)
+    scores = _scores(models, window, name, positions, quaternions, lights, patches)
     best = _best_per_block(scores, places, _BLOCK_M * per_metre)
     scores, places = np.take_along_axis(scores, best, axis=0).ravel(), places[best.ravel()]
     quaternions, heights = (np.tile(a, (len(best),) + (1,) * (a.ndim - 1)) for a in (quaternions, heights))
-    pixels = np.tile(camera.project(positions), (len(best), 1)) + places
-    directions = camera.ray_directions(pixels)
+    directions = camera.ray_directions(np.tile(camera.project(positions), (len(best), 1)) + places)
     eye = camera.T_world_camera.position
     far = (heights - eye[2]) / np.minimum(directions[:, 2], -1e-3)
     found = eye + far[:, None] * directions
@@ -364,14 +295,14 @@ def _match_at_anchor(
 
 
 def _best_per_block(scores: np.ndarray, places: np.ndarray, side: float) -> Int[np.ndarray, "B K"]:
-    """For each square block of shifted windows, and each template, the window where it scores best."""
+    """Find the window where each template scores best, in each square block of shifted windows."""
     blocks = np.floor(places / max(side, 1.0)).astype(int)
     members = [np.flatnonzero((blocks == block).all(axis=1)) for block in np.unique(blocks, axis=0)]
     return np.stack([own[scores[own].argmax(axis=0)] for own in members])
 
 
 def _patches(image: np.ndarray, x: int, y: int, side: int, shift: int) -> tuple[np.ndarray, np.ndarray]:
-    """Windows of an image around one, S x side x side x c, and by how much each is shifted (x, y).
+    """Cut shifted windows out of an image, S x side x side x c; return them and their shifts (x, y) [px].
 
     Beyond the image's border everything is black, and the table explains it.
     """
@@ -389,7 +320,7 @@ def _scores(
     models: ObjectModels, camera: Camera, name: str, positions: np.ndarray, quaternions: np.ndarray,
     directions: np.ndarray, patches: np.ndarray,
 ) -> Float[np.ndarray, "S K"]:  # fmt: skip
-    """How much better each of K templates explains each of S windows than the table does."""
+    """Compute how much better each of K templates explains each of S windows than the table does."""
     count, lights = len(positions), len(directions)
     batch = SceneBatch(
         (name,),
@@ -412,12 +343,11 @@ def _scores(
     return of_table - (squares - explained)
 
 
-def _non_maximum_suppression(
-    positions: np.ndarray, quaternions: np.ndarray, scores: np.ndarray, most: int
-) -> TemplateMatches:
-    """The best ones that differ in place or orientation."""
+def _non_maximum_suppression(poses: Pose, scores: np.ndarray, most: int) -> TemplateMatches:
+    """Keep the best ones that differ in place or orientation."""
     order = np.argsort(-scores)
-    positions, quaternions, scores = positions[order], quaternions[order], scores[order]
+    poses, scores = poses[order], scores[order]
+    positions, quaternions = poses.position, poses.quaternion
     kept, left = [], np.ones(len(scores), bool)
     while left.any() and len(kept) < most:
         k = int(left.argmax())
@@ -425,7 +355,7 @@ def _non_maximum_suppression(
         near = np.linalg.norm(positions - positions[k], axis=1) <= _NEAR_M
         left &= ~(near & (np.abs(quaternions @ quaternions[k]) >= np.cos(_NEAR_RAD / 2)))
         left[k] = False
-    return TemplateMatches(positions[kept], quaternions[kept], scores[kept])
+    return TemplateMatches(poses[kept], scores[kept])
 
 
 # Scenes put together from matches: which of them explain an image together, its light being unknown.
@@ -442,50 +372,10 @@ _KEPT_ROUGH, _KEPT = 8, 3  # of the scenes found under them, for another round, 
 _PLACES, _APART_M, _SECOND = 8, 0.03, 40  # places tried for the first of two objects, matches for the second
 
 
-def assemble_scene(
-    models: ObjectModels,
-    rough: ObservedViews,
-    coarse: ObservedViews,
-    start: SceneParameters,
-    matches: list[TemplateMatches],
-) -> Iterator[tuple[SceneParameters, float]]:
-    """Put scenes together; yields the best so far and its loss, each time one more was tried.
-
-    Args:
-        models: fields.
-        rough: images for all lights.
-        coarse: images for the best of them.
-        start: one scene to begin with; the others begin with no object.
-        matches: of each object.
-    """
-    yield from _SceneAssembly(models, rough, coarse, matches).scenes(start)
-
-
-def quick_scene(
-    models: ObjectModels,
-    rough: ObservedViews,
-    coarse: ObservedViews,
-    names: tuple[str, ...],
-    matches: list[TemplateMatches],
-) -> SceneParameters:
-    """A scene put together under few lights, good enough to tell whether the objects are there at all.
-
-    Args:
-        models: fields.
-        rough: images for all lights.
-        coarse: images for the best of them.
-        names: of the objects.
-        matches: of each object.
-    """
-    nowhere, unturned = (np.tile(part, (len(names), 1)) for part in (OUT_OF_VIEW.position, OUT_OF_VIEW.quaternion))
-    empty = SceneParameters(names, nowhere, unturned, np.array([0.0, 0.0, 1.0]), None)
-    return _SceneAssembly(models, rough, coarse, matches).quick_scene(empty)
-
-
 def reassign_poses(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, matches: list[TemplateMatches]
 ) -> SceneParameters:
-    """In turn each object at the match that explains whole images better than its pose does; the same if none.
+    """Put each object in turn at the match that explains whole images better than its pose does, if any does.
 
     Args:
         models: fields.
@@ -501,7 +391,7 @@ def reassign_poses(
 def best_placement(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, n: int, found: TemplateMatches
 ) -> tuple[SceneParameters, float]:
-    """The guess with an object where its photometric loss is least, where it is or at a match; and that loss.
+    """Put an object where the photometric loss is least, where it is or at a match; return the scene and its loss.
 
     Args:
         models: fields.
@@ -513,7 +403,7 @@ def best_placement(
     own, losses = loss_of(models, views, params), _losses(models, views, params, n, found)
     if losses.min(initial=np.inf) >= own:
         return params, own
-    return with_pose(params, n, found.pose(int(losses.argmin()))), float(losses.min())
+    return params.with_pose(n, found.poses[int(losses.argmin())]), float(losses.min())
 
 
 def _losses(
@@ -524,24 +414,38 @@ def _losses(
 
 
 def count_of_scenes(objects: int) -> int:
-    """How many steps it takes."""
+    """Return how many scenes `SceneAssembly.scenes` yields."""
     return 1 + len(hemisphere(_LIGHTS)) + _KEPT_ROUGH + _KEPT + objects * (objects - 1) // 2 + 1
 
 
 def without_objects(params: SceneParameters, numbers: Iterable[int]) -> SceneParameters:
     """The guess with some objects away."""
     for n in numbers:
-        params = with_pose(params, n, OUT_OF_VIEW)
+        params = params.with_pose(n, OUT_OF_VIEW)
     return params
 
 
-class _SceneAssembly:
+class SceneAssembly:
+    """Puts scenes together from matches.
+
+    Args:
+        models: fields.
+        rough: images for all lights.
+        coarse: images for the best of them.
+        matches: of each object.
+    """
+
     def __init__(
         self, models: ObjectModels, rough: ObservedViews, coarse: ObservedViews, matches: list[TemplateMatches]
     ) -> None:
         self._models, self._rough, self._coarse, self._sightings = models, rough, coarse, matches
 
     def scenes(self, start: SceneParameters) -> Iterator[tuple[SceneParameters, float]]:
+        """Yield the best scene so far and its loss, each time one more was tried.
+
+        Args:
+            start: one scene to begin with; the others begin with no object.
+        """
         empty = without_objects(start, range(len(self._sightings)))
         scenes = [start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))]
         for views, kept in ((self._rough, len(scenes)), (self._rough, _KEPT_ROUGH), (self._coarse, _KEPT)):
@@ -557,7 +461,10 @@ class _SceneAssembly:
             yield params, loss
         yield self._alternated(params, self._coarse)
 
-    def quick_scene(self, empty: SceneParameters) -> SceneParameters:
+    def quick_scene(self, names: tuple[str, ...]) -> SceneParameters:
+        """Put a scene together under few lights, good enough to decide whether the objects are there at all."""
+        nowhere = Pose.stacked([OUT_OF_VIEW] * len(names))
+        empty = SceneParameters(names, nowhere.position, nowhere.quaternion, OVERHEAD, None)
         begun = [self._alternated(replace(empty, light=light), self._rough) for light in hemisphere(_FEW_LIGHTS)]
         params, _ = min(begun, key=lambda pair: pair[1])
         for views in (self._rough, self._coarse):
@@ -565,7 +472,7 @@ class _SceneAssembly:
         return params
 
     def _alternated(self, params: SceneParameters, views: ObservedViews) -> tuple[SceneParameters, float]:
-        """In turn each object at its best match, and the light."""
+        """Put each object in turn at its best match, then search the light."""
         for n, found in enumerate(self._sightings):
             params, _ = best_placement(self._models, views, params, n, found)
         params = replace(params, light=search_light(self._models, self._rough, views, params))
@@ -576,18 +483,18 @@ class _SceneAssembly:
         best, least = params, loss
         first, second = pair
         rest = without_objects(params, pair)
-        others = self._sightings[second]
-        others = others.subset(self._ranking(rest, second)[:_SECOND])
+        others, few = self._sightings[second], self._ranking(rest, second)[:_SECOND]
+        others = TemplateMatches(others.poses[few], others.scores[few])
         for k in self._best_places(rest, first):
-            one = with_pose(rest, first, self._sightings[first].pose(k))
+            one = rest.with_pose(first, self._sightings[first].poses[k])
             both, loss = best_placement(self._models, self._coarse, one, second, others)
             if loss < least:
                 best, least = both, loss
         return best, least
 
     def _best_places(self, params: SceneParameters, n: int) -> list[int]:
-        """Numbers of the matches of an object that explain the image best, each in a place of its own."""
-        positions, kept = self._sightings[n].positions, []
+        """Return numbers of an object's matches that explain the image best, each in a place of its own."""
+        positions, kept = self._sightings[n].poses.position, []
         for k in self._ranking(params, n).tolist():
             if not kept or np.linalg.norm(positions[kept] - positions[k], axis=1).min() > _APART_M:
                 kept.append(k)

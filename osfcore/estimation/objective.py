@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.spatial import ConvexHull
 
-from osfcore.errors import UnknownName
+from osfcore.errors import InvalidInput, UnknownName
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
 from osfcore.geometry.cameras import MIN_IMAGE_SIDE, Camera
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
-from osfcore.geometry.poses import Pose, orthogonal_basis, quaternion_exp, quaternion_multiply, rotate
+from osfcore.geometry.poses import Pose, fibonacci_sphere, orthogonal_basis, quaternion_exp, quaternion_multiply, rotate
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.metrics.pose_errors import rotation_error
 from osfcore.objects.asset import Symmetry
@@ -63,12 +63,22 @@ class SceneParameters:
         """Length of the parameter vector."""
         return POSE * len(self.names) + LIGHT
 
+    def pose(self, number: int) -> Pose:
+        """`T_world_object` of one object."""
+        return Pose(self.positions[number], self.quaternions[number])
+
+    def with_pose(self, number: int, pose: Pose) -> SceneParameters:
+        """The scene with one object in another pose `T_world_object`."""
+        positions, quaternions = self.positions.copy(), self.quaternions.copy()
+        positions[number], quaternions[number] = pose.position, pose.quaternion
+        return replace(self, positions=positions, quaternions=quaternions)
+
     def state(self) -> SceneState:
         """The scene as a state."""
         return SceneState(self.names, Pose(self.positions, self.quaternions), Light(self.light), self.pusher)
 
     def perturbed(self, changes: Float[np.ndarray, "B P"]) -> SceneBatch:
-        """The B scenes that the rows of a batch of parameter vectors stand for."""
+        """Return the B scenes of a batch of parameter vectors, one per row."""
         count = len(self.names)
         poses = changes[:, : POSE * count].reshape(len(changes), count, POSE)
         positions = self.positions + poses[..., :3]
@@ -82,9 +92,18 @@ class SceneParameters:
         return SceneBatch(self.names, positions, quaternions, lights, pusher)
 
     def updated(self, change: Float[np.ndarray, "P"]) -> SceneParameters:
-        """The scene that one parameter vector stands for."""
+        """Return the scene of one parameter vector."""
         batch = self.perturbed(change[None])
         return replace(self, positions=batch.positions[0], quaternions=batch.quaternions[0], light=batch.lights[0])
+
+    def repeated(self, count: int = 1) -> SceneBatch:
+        """Return a batch of the scene itself, `count` times."""
+        return self.perturbed(np.zeros((count, self.size)))
+
+
+def empty_scene(light: Float[np.ndarray, "3"]) -> SceneBatch:
+    """Return a batch of one scene without objects and pusher, under a light [unit vector toward it]."""
+    return SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), light[None], None)
 
 
 # How an object can lie on a table, from its field alone.
@@ -139,36 +158,40 @@ class RestingOrientations:
     radius: float
     hull: Float[np.ndarray, "H 3"]
 
+    @property
+    def origin_heights(self) -> Float[np.ndarray, "K"]:
+        """Height of the object's origin above the table in each orientation [m]."""
+        return self.heights - rotate(self.quaternions, self.centre)[:, 2]
+
     def lowest(self, pose: Pose) -> float:
         """Height of the lowest point of the object in a pose [m]."""
         return float(pose.apply(self.hull)[:, 2].min())
 
+    def poses_at(self, centres: Float[np.ndarray, "K 3"], quaternions: Float[np.ndarray, "K 4"]) -> Pose:
+        """Return poses in given orientations whose centres of mass lie at given places [m]."""
+        return Pose(centres - rotate(quaternions, self.centre), quaternions)
+
 
 def resting_orientations(field: DensityGrid, *, yaws: int = _YAWS) -> RestingOrientations:
-    """Find them for a field; `yaws` steps about the vertical."""
+    """Find the resting orientations of a field, each turned about the vertical in `yaws` steps."""
     vertices, centre = _solid(field)
     directions = fibonacci_sphere(_DIRECTIONS)
     heights = ((vertices - centre) @ directions.T).max(axis=0)
     down = _stable(directions, heights)
     lying = np.array([_rotation_downwards(directions[k]) for k in down])
-    turns = yaw_quaternions(np.arange(yaws) * 2 * np.pi / yaws)
-    quaternions = quaternion_multiply(turns[None], lying[:, None]).reshape(-1, 4)
+    quaternions = quaternion_multiply(full_circle(yaws)[None], lying[:, None]).reshape(-1, 4)
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
     return RestingOrientations(quaternions, np.repeat(heights[down], yaws), centre, radius, vertices)
 
 
-def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
-    """Unit vectors spread evenly over the sphere (a Fibonacci lattice)."""
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    azimuth = np.pi * (1 + 5**0.5) * k
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
-
-
 def yaw_quaternions(angles: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K 4"]:
-    """Turns about the vertical by angles [rad]."""
+    """Return turns about the vertical by angles [rad]."""
     return quaternion_exp(np.stack([np.zeros_like(angles), np.zeros_like(angles), angles], axis=1))
+
+
+def full_circle(steps: int) -> Float[np.ndarray, "steps 4"]:
+    """Return turns about the vertical in equal steps, beginning with none."""
+    return yaw_quaternions(np.arange(steps) * 2 * np.pi / steps)
 
 
 def _solid(field: DensityGrid) -> tuple[np.ndarray, np.ndarray]:
@@ -266,7 +289,7 @@ class ObjectModels:
 
     @property
     def can_change(self) -> bool:
-        """Whether `changed` works: not where another renderer draws fields of its own kind."""
+        """True if `changed` works: not where another renderer draws fields of its own kind."""
         return self._changeable is not None
 
     def changed(
@@ -278,8 +301,14 @@ class ObjectModels:
             names: of the objects.
             field: from a field to the one in its place, of the same density.
             table: likewise of the table.
+
+        Raises:
+            InvalidInput: where `can_change` is false.
         """
-        assert self._changeable is not None, "can_change tells"
+        if self._changeable is None:
+            raise InvalidInput(
+                "renderer of the models to change", "of another kind", "the one that they were made with"
+            )
         fields, ground, device = self._changeable
         changed = {name: field(fields[name]) for name in names}
         models = ObjectModels(changed, table(ground), device=device, symmetries=self._symmetries)
@@ -304,20 +333,25 @@ class ObjectModels:
         return np.array([rotation_error(symmetry, other, one) for other in others])
 
     def resting(self, name: str) -> RestingOrientations:
-        """How an object can lie on a table, found when first asked for."""
+        """Return how an object can lie on a table; it is found when first asked for."""
         if name not in self._resting:
             self.check((name,))
             self._resting[name] = resting_orientations(self._fields[name])
         return self._resting[name]
 
+    def centre_of_mass(self, params: SceneParameters, number: int) -> Float[np.ndarray, "3"]:
+        """Where the centre of mass of an object of a scene is [m]."""
+        centre = self.resting(params.names[number]).centre
+        return params.positions[number] + rotate(params.quaternions[number], centre)
+
 
 # Observations at the resolutions the estimator works at, and the parts of them that show one object.
 
 
-FINE_SIDE = 128  # more pixels would cost time and tell little
+FINE_SIDE = 128  # more pixels would cost time and add little
 _BESIDE_PX = 3  # of its silhouette that an object may come to cover in one step
-_MARGIN_PX = 3  # around an object's sphere
-_OTHER_SHARE = 0.3  # of a pixel that others may cover before it tells nothing about an object
+_MARGIN_PX = 3  # around an object's sphere or its masks
+_OTHER_SHARE = 0.3  # of a pixel that others may cover before it does not count for an object
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -387,20 +421,19 @@ class ObjectView:
     quality: Quality
 
 
-def crop_to_masks(views: ObservedViews, number: int, *, margin: int = 3) -> ObjectView:
+def crop_to_masks(views: ObservedViews, number: int) -> ObjectView:
     """The windows around one object's masks.
 
     Args:
         views: with masks; views in which the object's is empty are left out, and at least one must not be.
         number: of the object.
-        margin: around the largest mask [px].
     """
     assert views.masks is not None
     shown = [v for v, mask in enumerate(views.masks[:, number]) if mask.max() > 0.5]
     own = views.masks[shown, number]
     others = np.delete(views.masks[shown], number, axis=1)
     covered = others.max(axis=1) if others.shape[1] else np.zeros_like(own)
-    corners, (width, height) = _crop_windows(own > 0.5, margin)
+    corners, (width, height) = _crop_windows(own > 0.5)
 
     def cut(array: np.ndarray) -> np.ndarray:
         return np.stack([a[y : y + height, x : x + width] for a, (x, y) in zip(array, corners, strict=True)])
@@ -425,16 +458,15 @@ def crop_to_object(
         number: of the object.
         reach: by how much the windows reach beyond that sphere [m].
     """
-    resting = models.resting(params.names[number])
-    centre = params.positions[number] + rotate(params.quaternions[number], resting.centre)
+    radius, centre = models.resting(params.names[number]).radius, models.centre_of_mass(params, number)
     height, width = views.images.shape[1:3]
     boxes = []
     for view, camera in enumerate(views.cameras):
         depth = float(camera.T_world_camera.inverse().apply(centre)[2])
-        if depth < resting.radius:
+        if depth < radius:
             continue
         x, y = camera.project(centre)
-        half = camera.intrinsics[0, 0] / depth * (resting.radius + reach) + _MARGIN_PX
+        half = camera.intrinsics[0, 0] / depth * (radius + reach) + _MARGIN_PX
         if -half < x < width + half and -half < y < height + half:
             boxes.append((view, x, y, half))
     if not boxes:
@@ -445,8 +477,7 @@ def crop_to_object(
     cameras = tuple(crop_camera(views.cameras[v], x, y, w, h) for (v, *_), (x, y) in zip(boxes, corners, strict=True))
     windows = [(v, slice(y, y + h), slice(x, x + w)) for (v, *_), (x, y) in zip(boxes, corners, strict=True)]
     images = np.stack([views.images[window] for window in windows])
-    only = None if views.only is None else np.stack([views.only[window] for window in windows])
-    return ObservedViews(cameras, images, None, views.pusher, views.quality, only)
+    return ObservedViews(cameras, images, None, views.pusher, views.quality)
 
 
 def crop_to_silhouette(
@@ -489,7 +520,7 @@ def crop_camera(camera: Camera, x: int, y: int, width: int, height: int) -> Came
     return replace(camera, intrinsics=intrinsics, width=width, height=height)
 
 
-def _crop_windows(masks: Bool[np.ndarray, "V h w"], margin: int) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+def _crop_windows(masks: Bool[np.ndarray, "V h w"]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
     """Corners (x, y) of windows around masks, none of them empty, and their common width and height [px]."""
     height, width = masks.shape[1:]
     boxes = []
@@ -498,8 +529,8 @@ def _crop_windows(masks: Bool[np.ndarray, "V h w"], margin: int) -> tuple[list[t
         boxes.append((columns[0], columns[-1] + 1, rows[0], rows[-1] + 1))
     x0, x1, y0, y1 = np.array(boxes).T
     size = (
-        int(np.clip((x1 - x0).max() + 2 * margin, min(MIN_IMAGE_SIDE, width), width)),
-        int(np.clip((y1 - y0).max() + 2 * margin, min(MIN_IMAGE_SIDE, height), height)),
+        int(np.clip((x1 - x0).max() + 2 * _MARGIN_PX, min(MIN_IMAGE_SIDE, width), width)),
+        int(np.clip((y1 - y0).max() + 2 * _MARGIN_PX, min(MIN_IMAGE_SIDE, height), height)),
     )
     x = np.clip((x0 + x1 - size[0]) // 2, 0, width - size[0])
     y = np.clip((y0 + y1 - size[1]) // 2, 0, height - size[1])
@@ -543,7 +574,25 @@ def loss_of(models: ObjectModels, views: ObservedViews, params: SceneParameters)
         views: what was observed.
         params: the scene.
     """
-    return float(photometric_loss(residuals(models, views, params.perturbed(np.zeros((1, params.size)))))[0])
+    return float(photometric_loss(residuals(models, views, params.repeated()))[0])
+
+
+def pose_losses(
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, number: int, poses: Pose
+) -> Float[np.ndarray, "K"]:
+    """Photometric loss of a scene with one object in each of K poses.
+
+    Args:
+        models: fields.
+        views: images to compare with, whole ones or windows around the object.
+        params: the guess; all other objects and the light stay.
+        number: of the object.
+        poses: the K poses, a batch of `T_world_object`.
+    """
+    batch = params.repeated(len(poses.position))
+    positions, quaternions = batch.positions.copy(), batch.quaternions.copy()
+    positions[:, number], quaternions[:, number] = poses.position, poses.quaternion
+    return photometric_loss(residuals(models, views, replace(batch, positions=positions, quaternions=quaternions)))
 
 
 # The masked loss: one object rendered alone against the images inside its masks (paper eq. 5), many poses at once.
@@ -568,12 +617,7 @@ class RenderedObject:
 
 
 def render_poses(
-    models: ObjectModels,
-    name: str,
-    part: ObjectView,
-    positions: Float[np.ndarray, "B 3"],
-    quaternions: Float[np.ndarray, "B 4"],
-    light: Float[np.ndarray, "3"],
+    models: ObjectModels, name: str, part: ObjectView, poses: Pose, light: Float[np.ndarray, "3"]
 ) -> RenderedObject:
     """Render one object in B poses, alone.
 
@@ -581,12 +625,11 @@ def render_poses(
         models: fields.
         name: of the object.
         part: the crop whose cameras and quality are used.
-        positions: of the object's origin [m].
-        quaternions: rotations from the object's frame to the world, unit.
+        poses: the B poses, a batch of `T_world_object`.
         light: unit vector toward the light, the same for all poses.
     """
-    lights = np.tile(light, (len(positions), 1))
-    batch = SceneBatch((name,), positions[:, None], quaternions[:, None], lights, None)
+    lights = np.tile(light, (len(poses.position), 1))
+    batch = SceneBatch((name,), poses.position[:, None], poses.quaternion[:, None], lights, None)
     rendered = models.alone.render(batch, part.cameras, quality=part.quality, outputs={"rgb", "opacity"})
     assert rendered.opacity is not None
     return RenderedObject(rendered.rgb, rendered.opacity[:, :, 0])

@@ -1,19 +1,97 @@
-"""The image model of pictures of unknown exposure, response, ambient light and table, fitted at known poses."""
+"""The image model of pictures of unknown exposure, response, ambient light and table: check, and fit at known poses."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from osfcore.estimation.camera_response import ImageModel
-from osfcore.estimation.objective import LIGHT, ObjectModels, ObservedViews, SceneParameters
-from osfcore.estimation.search import hemisphere
+from osfcore.estimation.objective import ObjectModels, ObservedViews, SceneParameters, empty_scene
+from osfcore.estimation.search import (
+    FIRST_STEP_RAD,
+    LIGHT_ROUNDS,
+    SHRINKING,
+    TABLE_COLOUR,
+    hemisphere,
+    light_neighbours,
+    table_light,
+)
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
-from osfcore.render.types import SceneBatch
+from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
+
+# Whether pictures show the table as it is known, from its pixels alone: a check before any estimate.
+#
+# Every pixel of the known table obeys I_c = albedo_c (ambient + x direct), with x = 0 in shadow and the same x
+# where the lamp reaches it. Another exposure, response or ambient light moves the shadows away from x = 0, another
+# table changes the colours. Where no shadow is seen, as under a lamp overhead, only colours can differ.
+
+
+TableVerdict = Literal["usual", "unclear", "other"]
+_MASK_ERROR_PX, _BESIDE = 2, 0.02  # of masks, and of the image's side: where nothing is table for sure
+_FEWEST = 200  # pixels of table, without which nothing is decided
+_DARKEST = 0.001, 0.003  # shares of the pixels; where both lie well in shadow, it is as dark everywhere
+_SAME = 0.025  # difference of x within a shadow
+_SHADOW, _BRIGHTEST = 0.05, 1.06  # |x| in shadow, and x in full light
+_LEAST_CONTRAST = 0.05  # of x: less is noise, not a shadow
+
+
+def check_table(models: ObjectModels, views: ObservedViews) -> TableVerdict:
+    """Compare the table's pixels with the known table.
+
+    Args:
+        models: of which the table is used.
+        views: pictures with masks.
+
+    Returns:
+        "usual", or "other" where something speaks against the usual image model; "unclear" where no full shadow is
+        seen: then another lamp may explain what another exposure does.
+    """
+    x, error, on_table = table_light(models, views)
+    table = _table_pixels(views, on_table)
+    if table.sum() < _FEWEST:
+        return "unclear"
+    darkest, shadow, brightest = np.quantile(x[table], [*_DARKEST, 0.99])
+    colour = float(np.median(error[table]))
+    has_shadow = brightest - shadow > _LEAST_CONTRAST and shadow - darkest < _SAME
+    is_dark = abs(shadow) < _SHADOW if has_shadow else darkest > -_SHADOW
+    is_usual = is_dark and brightest < _BRIGHTEST and colour < TABLE_COLOUR
+    if not is_usual:
+        return "other"
+    return "usual" if has_shadow else "unclear"
+
+
+def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:
+    """Find pixels that show nothing but table, well within its edge."""
+    reach = _MASK_ERROR_PX + round(_BESIDE * max(on_table.shape[1:]))
+    kernel = np.ones((2 * reach + 1,) * 2, np.uint8)
+    other = ~on_table
+    if views.masks is not None and views.masks.shape[1]:
+        other |= views.masks.max(axis=1) > 0
+    if views.pusher is not None:
+        other |= _pusher_pixels(views)
+    return np.stack([cv2.dilate(part.astype(np.uint8), kernel) == 0 for part in other])
+
+
+def _pusher_pixels(views: ObservedViews) -> np.ndarray:
+    """Draw the pusher's outline in each view, about, from points of its axis."""
+    assert views.pusher is not None
+    shown = np.zeros(views.images.shape[:3], np.uint8)
+    axis = views.pusher + np.linspace(-0.5, 0.5, 9)[:, None] * [0.0, 0.0, PUSHER_HEIGHT_M]
+    for picture, camera in zip(shown, views.cameras, strict=True):
+        depth = camera.T_world_camera.inverse().apply(axis)[:, 2]
+        if depth.min() <= PUSHER_RADIUS_M:
+            continue
+        radius = int(np.ceil(camera.intrinsics[0, 0] * PUSHER_RADIUS_M / depth.min()))
+        for x, y in camera.project(axis):
+            cv2.circle(picture, (int(x), int(y)), radius, 1, -1)
+    return shown > 0
+
 
 # Fields and tables with factors on albedo and ambient light: what an image model makes of those of the library.
 
@@ -64,23 +142,20 @@ def scaled_table(table: TableField, albedo: Float[np.ndarray, "3"], ambient: flo
 #
 # so that for each l and r the gains are two small least-squares problems, weighted by truncated errors. l and r are
 # searched: over the hemisphere and a range of r, then on shrinking grids around the best. Neither the exposure nor
-# the table's colour enter: shading of objects, and the contrast of shadows on the table tell l and r.
+# the table's colour enter: l and r follow from the shading of objects and the contrast of shadows on the table.
 
 
-_DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
 _AMBIENT = np.geomspace(0.2, 8.0, 11)  # r: shares of ambient light from 6 to 73 %
-_FIRST_STEP_RAD, _FIRST_FACTOR = np.deg2rad(8.0), 1.3
-_ROUNDS, _SHRINKING = 6, 0.6
+_FIRST_FACTOR = 1.3  # of r, from one place of the first grid to the next
 _SURVIVORS = 4
 _TRUNCATED = 0.25  # of the pictures' mean brightness: shadows that are elsewhere, and wrong sides of objects
 _OPAQUE, _CLEAR = 0.9, 0.05  # shares of pixels that count as an object's, and as the table's
 _SATURATED, _DARK = 0.985, 1e-6  # of full scale; where pictures are black, errors are relative to this
-_OFFSETS = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Calibration:
-    """What pictures tell of their making.
+    """Image model and lamp of some pictures.
 
     Attributes:
         model: exposure, ambient light and table.
@@ -119,11 +194,11 @@ class Calibrator:
             params: the objects; its light plays no part.
         """
         pixels = self._pixels(rough, params)
-        directions = hemisphere(_DIRECTIONS)
+        directions = hemisphere()
         costs = pixels.costs(self._direct_parts(rough, params, directions, pixels), _AMBIENT)
         found = np.argsort(costs, axis=None)[: 2 * _SURVIVORS]
         best = [(directions[k // len(_AMBIENT)], float(_AMBIENT[k % len(_AMBIENT)])) for k in found]
-        return self._refined(fine, params, best, _FIRST_STEP_RAD, _FIRST_FACTOR, _ROUNDS)
+        return self._refined(fine, params, best, FIRST_STEP_RAD, _FIRST_FACTOR, LIGHT_ROUNDS)
 
     def refine(self, views: ObservedViews, params: SceneParameters, ambient: float, *, hold_light: bool) -> Calibration:
         """Improve a calibration, now that the poses are known.
@@ -134,7 +209,7 @@ class Calibrator:
             ambient: r likewise.
             hold_light: the lamp is where it is.
         """
-        step = 0.0 if hold_light else _FIRST_STEP_RAD / 4
+        step = 0.0 if hold_light else FIRST_STEP_RAD / 4
         return self._refined(views, params, [(params.light, ambient)], step, _FIRST_FACTOR**0.5, 3, kept=1)
 
     def _refined(
@@ -152,7 +227,7 @@ class Calibrator:
         for _ in range(rounds):
             tried: list[tuple[float, np.ndarray, float]] = []
             for light, ambient in best:
-                lights = _neighbours(params, light, step) if step else light[None]
+                lights = light_neighbours(params, light, step) if step else light[None]
                 around = ambient * factor ** np.array([-1.0, 0.0, 1.0])
                 costs = pixels.costs(self._direct_parts(views, params, lights, pixels), around)
                 tried += [
@@ -160,7 +235,7 @@ class Calibrator:
                 ]
             tried.sort(key=lambda one: one[0])
             cost, best = tried[0][0], [(light, ambient) for _, light, ambient in tried[:kept]]
-            step, factor = step * _SHRINKING, factor**_SHRINKING
+            step, factor = step * SHRINKING, factor**SHRINKING
         light, ambient = best[0]
         direct = self._direct_parts(views, params, light[None], pixels)[0]
         objects, table = pixels.gains(direct, ambient)
@@ -168,9 +243,8 @@ class Calibrator:
         return Calibration(model, light, float(cost))
 
     def _pixels(self, views: ObservedViews, params: SceneParameters) -> _Pixels:
-        """The pixels that count, with what is seen there and its ambient part."""
-        batch = params.perturbed(np.zeros((1, params.size)))
-        nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), params.light[None], None)
+        """Choose the pixels that count, with what is seen there and its ambient part."""
+        batch, nothing = params.repeated(), empty_scene(params.light)
         whole = self._whole.together.render(batch, views.cameras, quality=views.quality, outputs={"rgb", "opacity"})
         direct = self._direct.together.render(batch, views.cameras, quality=views.quality).rgb[0]
         empty, lit = (m.together.render(nothing, views.cameras, quality=views.quality).rgb[0]
@@ -193,14 +267,14 @@ class Calibrator:
     def _direct_parts(
         self, views: ObservedViews, params: SceneParameters, lights: np.ndarray, pixels: _Pixels
     ) -> Float32[np.ndarray, "L P 3"]:
-        batch = replace(params.perturbed(np.zeros((len(lights), params.size))), lights=lights)
+        batch = replace(params.repeated(len(lights)), lights=lights)
         rendered = self._direct.together.render(batch, views.cameras, quality=views.quality, only=pixels.counted)
         return rendered.rgb[:, pixels.counted]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Pixels:
-    """P pixels of which the model tells something.
+    """P pixels that the model describes.
 
     Attributes:
         counted: where they are.
@@ -217,7 +291,7 @@ class _Pixels:
     surroundings: Float[np.ndarray, "3"] | None
 
     def costs(self, direct: Float32[np.ndarray, "L P 3"], ambients: Float[np.ndarray, "R"]) -> np.ndarray:
-        """Mean truncated errors, L x R."""
+        """Compute the mean truncated errors, L x R."""
         costs = np.zeros((len(direct), len(ambients)))
         for kind in (self.of_objects, ~self.of_objects):
             if not kind.any():
@@ -231,7 +305,7 @@ class _Pixels:
         return costs
 
     def gains(self, direct: Float32[np.ndarray, "P 3"], ambient: float) -> tuple[np.ndarray, np.ndarray]:
-        """Of objects and table, per colour; where one of them does not show, that of the other."""
+        """Fit the gains of objects and table, per colour; where one of them does not show, that of the other."""
         found = []
         for kind in (self.of_objects, ~self.of_objects):
             if kind.any():
@@ -245,7 +319,7 @@ class _Pixels:
 def _fit(
     shown: Float32[np.ndarray, "L P 3"], seen: Float32[np.ndarray, "P 3"], most: float, rounds: int = 1
 ) -> tuple[Float32[np.ndarray, "L 3"], Float32[np.ndarray, "L P 3"]]:
-    """Gains of least squares without the pixels whose error is above `most`, and errors."""
+    """Fit gains by least squares without the pixels whose error is above `most`; return them and the errors."""
     gains = _ratio((shown * seen).sum(axis=1), (shown * shown).sum(axis=1))
     for _ in range(rounds):
         weights = (np.abs(gains[:, None] * shown - seen) < most).astype(np.float32)
@@ -256,9 +330,3 @@ def _fit(
 
 def _ratio(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
     return np.maximum(upper, 1e-3) / np.maximum(lower, 1e-3)
-
-
-def _neighbours(params: SceneParameters, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:
-    changes = np.zeros((len(_OFFSETS), params.size))
-    changes[:, -LIGHT:] = step * _OFFSETS
-    return replace(params, light=light).perturbed(changes).lights

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -24,7 +23,7 @@ from osfcore.estimation.objective import (
     RestingOrientations,
     SceneParameters,
     crop_to_silhouette,
-    fibonacci_sphere,
+    empty_scene,
     masked_loss,
     photometric_loss,
     render_poses,
@@ -33,11 +32,10 @@ from osfcore.estimation.objective import (
 from osfcore.estimation.steps import EstimateStep, Stage
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
-from osfcore.geometry.poses import Pose, rotate, rotation_angle
+from osfcore.geometry.poses import Pose, fibonacci_sphere, rotation_angle
 from osfcore.geometry.states import EstimatedState
-from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
+from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.progress import Progress
-from osfcore.render.types import SceneBatch
 
 # CMA-ES (Hansen, 2016, arXiv 1604.00772) by the `cma` library, in its ask-and-tell form.
 #
@@ -114,10 +112,9 @@ PLANAR_PARAMETERS = (0, 1, 5)  # among an object's numbers: x, y and the turn ab
 POSE_PARAMETERS = tuple(range(POSE))
 _SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.1, 0.02  # half the width of central differences
 _MOST_SHIFT_M, _MOST_TURN_RAD, _MOST_LIGHT_RAD = 0.03, 0.4, 0.3
-_DAMPINGS = np.array(
-    [0.1, 0.1, 0.1, 1.0, 10.0, 100.0]
-)  # lambda: these multiples of the last good one are tried at once
-_STEP_SCALES = (4.0, 2.0, 1.0, 1.0, 1.0, 1.0)  # of delta, for each of these lambdas
+# lambda: these multiples of the last good one are tried at once, each with its own scale of delta.
+_DAMPINGS = np.array([0.1, 0.1, 0.1, 1.0, 10.0, 100.0])
+_STEP_SCALES = (4.0, 2.0, 1.0, 1.0, 1.0, 1.0)
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e6
 _CONVERGED_RATIO = 0.97  # of the losses after and before a sweep, from which on it counts as converged
 _TINY = 1e-9
@@ -146,6 +143,10 @@ class GaussNewtonState:
         count = len(params.names)
         normals = (*(np.zeros((POSE, POSE)) for _ in range(count)), np.zeros((LIGHT, LIGHT)))
         return GaussNewtonState(params, np.full(count + 1, np.inf), normals, (_FIRST_DAMPING,) * (count + 1))
+
+    def undamped(self) -> GaussNewtonState:
+        """The same iterate with the first dampings: those of another place or of other images do not apply."""
+        return replace(self, dampings=(_FIRST_DAMPING,) * len(self.dampings))
 
 
 def gauss_newton(
@@ -194,7 +195,7 @@ def gauss_newton(
 def _damped_step(
     models: ObjectModels, views: ObservedViews, at: GaussNewtonState, block: int, numbers: Int[np.ndarray, "n"]
 ) -> GaussNewtonState:
-    """One damped step on some entries of the parameter vector (equation in the module's docstring)."""
+    """Take one damped step on some entries of the parameter vector (the equation above)."""
     params, half = at.params, difference_steps(len(at.params.names))
     probes = np.zeros((1 + 2 * len(numbers), params.size))
     for row, number in enumerate(numbers):
@@ -218,20 +219,12 @@ def _damped_step(
         damping = max(float(dampings[best]), _LEAST_DAMPING)
     else:
         damping = min(float(dampings[-1]), _MOST_DAMPING)
-    whole = np.zeros_like(at.normals[block])
     own = numbers - POSE * block
-    whole[np.ix_(own, own)] = normal
-    return _accept_step(at, params, block, here, whole, damping)
-
-
-def _accept_step(
-    at: GaussNewtonState, params: SceneParameters, block: int, loss: float, normal: np.ndarray, damping: float
-) -> GaussNewtonState:
-    losses = at.losses.copy()
-    losses[block] = loss
-    normals = (*at.normals[:block], normal, *at.normals[block + 1 :])
-    dampings = (*at.dampings[:block], damping, *at.dampings[block + 1 :])
-    return GaussNewtonState(params, losses, normals, dampings)
+    losses, normals, all_dampings = at.losses.copy(), list(at.normals), list(at.dampings)
+    losses[block], all_dampings[block] = here, damping
+    normals[block] = np.zeros_like(at.normals[block])
+    normals[block][np.ix_(own, own)] = normal
+    return GaussNewtonState(params, losses, tuple(normals), tuple(all_dampings))
 
 
 def difference_steps(count: int) -> Float[np.ndarray, "P"]:
@@ -259,28 +252,28 @@ class RankedPoses:
     """Poses of one object from which a search may start, the best first.
 
     Attributes:
-        positions: of the object's origin [m].
-        quaternions: unit.
+        poses: K poses `T_world_object`.
         losses: `masked_loss` of each.
     """
 
-    positions: Float[np.ndarray, "K 3"]
-    quaternions: Float[np.ndarray, "K 4"]
+    poses: Pose
     losses: Float[np.ndarray, "K"]
-
-    def best(self, count: int) -> RankedPoses:
-        """The best `count`."""
-        return RankedPoses(self.positions[:count], self.quaternions[:count], self.losses[:count])
 
     def distinct(self, count: int) -> RankedPoses:
         """The best `count` whose orientations differ by more than 25 degrees from better ones."""
-        kept: list[int] = []
-        for k in range(len(self.losses)):
-            if all(rotation_angle(self.quaternions[k], self.quaternions[other]) > _DISTINCT_RAD for other in kept):
-                kept.append(k)
-            if len(kept) == count:
-                break
-        return RankedPoses(self.positions[kept], self.quaternions[kept], self.losses[kept])
+        kept = distinct_orientations(self.poses.quaternion, count, _DISTINCT_RAD)
+        return RankedPoses(self.poses[kept], self.losses[kept])
+
+
+def distinct_orientations(quaternions: Float[np.ndarray, "K 4"], count: int, apart_rad: float) -> list[int]:
+    """Return numbers of the first `count` orientations that are more than `apart_rad` from all kept before."""
+    kept: list[int] = []
+    for k in range(len(quaternions)):
+        if all(rotation_angle(quaternions[k], quaternions[other]) > apart_rad for other in kept):
+            kept.append(k)
+        if len(kept) == count:
+            break
+    return kept
 
 
 def initial_poses(models: ObjectModels, name: str, part: ObjectView) -> RankedPoses:
@@ -293,43 +286,39 @@ def initial_poses(models: ObjectModels, name: str, part: ObjectView) -> RankedPo
         name: of the object.
         part: windows around its masks.
     """
-    resting = models.resting(name)
-    positions = _positions_along_rays(part, resting)
+    poses = _poses_along_rays(part, models.resting(name))
     for _ in range(_CENTRING_ROUNDS):
-        look = render_poses(models, name, part, positions, resting.quaternions, OVERHEAD)
-        positions = _centre_on_mask(look, part, positions)
-    return rank_poses(models, name, part, positions, resting.quaternions, OVERHEAD, any_brightness=True)
+        look = render_poses(models, name, part, poses, OVERHEAD)
+        poses = Pose(_centre_on_mask(look, part, poses.position), poses.quaternion)
+    return rank_poses(models, name, part, poses, OVERHEAD, any_brightness=True)
 
 
 def rank_poses(
     models: ObjectModels,
     name: str,
     part: ObjectView,
-    positions: Float[np.ndarray, "K 3"],
-    quaternions: Float[np.ndarray, "K 4"],
+    poses: Pose,
     light: Float[np.ndarray, "3"],
     *,
     any_brightness: bool = False,
 ) -> RankedPoses:
-    """Poses in the order of their masked loss, the best first.
+    """Sort poses by their masked loss, the best first.
 
     Args:
         models: fields.
         name: of the object.
         part: windows around its masks.
-        positions: of the object's origin [m].
-        quaternions: rotations from the object's frame to the world, unit.
+        poses: a batch of `T_world_object`.
         light: unit vector toward the light.
         any_brightness: compare colours up to a factor, see `masked_loss`.
     """
-    look = render_poses(models, name, part, positions, quaternions, light)
-    losses = masked_loss(look, part, any_brightness=any_brightness)
+    losses = masked_loss(render_poses(models, name, part, poses, light), part, any_brightness=any_brightness)
     order = np.argsort(losses)
-    return RankedPoses(positions[order], quaternions[order], losses[order])
+    return RankedPoses(poses[order], losses[order])
 
 
-def _positions_along_rays(part: ObjectView, resting: RestingOrientations) -> Float[np.ndarray, "K 3"]:
-    """Positions at which the centre of mass is closest to the lines of sight through the masks' centroids.
+def _poses_along_rays(part: ObjectView, resting: RestingOrientations) -> Pose:
+    """Put resting orientations where the centre of mass is closest to the rays through the masks' centroids.
 
     Its height over the table is nearly given by how the object lies, so one view is enough.
     """
@@ -345,13 +334,13 @@ def _positions_along_rays(part: ObjectView, resting: RestingOrientations) -> Flo
     heights = np.outer(resting.heights, (0.0, 0.0, _HEIGHT_WEIGHT))
     centres = np.linalg.solve(normal + up, (target + heights).T).T
     centres[:, :2] = np.clip(centres[:, :2], -TABLE_SIDE_M / 2, TABLE_SIDE_M / 2)
-    return centres - rotate(resting.quaternions, resting.centre)
+    return resting.poses_at(centres, resting.quaternions)
 
 
 def _centre_on_mask(
     look: RenderedObject, part: ObjectView, positions: Float[np.ndarray, "B 3"]
 ) -> Float[np.ndarray, "B 3"]:
-    """Positions moved, by least squares over the views, so that silhouettes have the centroids of the masks."""
+    """Move positions, by least squares over the views, so that silhouettes have the centroids of the masks."""
     wanted, _ = _centroids(part.mask * part.valid)
     found, sizes = _centroids(look.opacity * part.valid)
     normal = np.tile(np.diag([1e-3, 1e-3, 1e-3]), (len(positions), 1, 1))
@@ -361,7 +350,7 @@ def _centre_on_mask(
         slope = slope * (sizes[:, view] > _MIN_PIXELS)[:, None, None]
         normal += np.swapaxes(slope, 1, 2) @ slope
         target += np.einsum("bij,bi->bj", slope, wanted[view] - found[:, view])
-    if len(part.cameras) == 1:  # one view cannot tell distance from size; the object lies on the table
+    if len(part.cameras) == 1:  # one view does not separate distance from size; the object lies on the table
         normal[:, 2, 2] += 1e9
     step = np.linalg.solve(normal, target[..., None])[..., 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)
@@ -377,7 +366,7 @@ def _centroids(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _projection_slope(camera: Camera, points: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B 2 3"]:
-    """How pixel coordinates change with a point in the world [px / m]."""
+    """Derivatives of pixel coordinates by a point in the world [px / m]."""
     inverse = camera.T_world_camera.inverse().matrix()
     x, y, z = (points @ inverse[:3, :3].T + inverse[:3, 3]).T
     z = np.maximum(z, 1e-3)
@@ -387,29 +376,17 @@ def _projection_slope(camera: Camera, points: Float[np.ndarray, "B 3"]) -> Float
     return slope @ inverse[:3, :3]
 
 
-# CMA-ES over one object's pose from several starts at once, by the masked loss (paper eq. 5).
+# CMA-ES over poses: of one object by the masked loss (paper eq. 5), of scenes by the photometric loss (eq. 6).
+#
+# They are two because an object in its masks is searched from several starts at once, side by side with the other
+# objects, while a scene is searched around one guess, which counts as a candidate: the result is never worse.
 
 
 SHIFT_M, TURN_RAD = 4e-3, 0.12  # the first spread
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class CMAGeneration:
-    """One generation of all searches.
-
-    Attributes:
-        candidates: poses, of all starts together.
-        loss: of the best.
-        sigma: step of the first start's search, 1 at the beginning.
-    """
-
-    candidates: Pose
-    loss: float
-    sigma: float
-
-
 class MultistartCMA:
-    """One CMA-ES for each start of an object; a generation of all is rendered as one batch.
+    """One CMA-ES by the masked loss for each start of an object; a generation of all is rendered as one batch.
 
     Args:
         models: fields.
@@ -434,93 +411,190 @@ class MultistartCMA:
         rng: np.random.Generator,
         any_brightness: bool,
     ) -> None:
-        self._models, self._name, self._part, self._starts, self._light = models, name, part, starts, light
+        self._models, self._name, self._part, self._starts, self._light = models, name, part, starts.poses, light
         self._any_brightness = any_brightness
         scales = np.array([SHIFT_M] * 3 + [TURN_RAD] * 3 + [0.0] * LIGHT)
-        begun = zip(starts.positions, starts.quaternions, strict=True)
+        begun = zip(starts.poses.position, starts.poses.quaternion, strict=True)
         self._guesses = [SceneParameters((name,), p[None], q[None], light, None) for p, q in begun]
         self._searches = [CMAES(scales, population, rng) for _ in self._guesses]
 
-    def advance(self) -> CMAGeneration:
-        """One more generation of every search."""
+    @property
+    def sigma(self) -> float:
+        """Step of the first start's search, 1 at the beginning."""
+        return self._searches[0].sigma
+
+    def advance(self) -> tuple[Pose, float]:
+        """Try one more generation of every search; return its candidates, and the loss of the best."""
         batches = [g.perturbed(s.ask()) for g, s in zip(self._guesses, self._searches, strict=True)]
-        positions = np.concatenate([b.positions[:, 0] for b in batches])
-        quaternions = np.concatenate([b.quaternions[:, 0] for b in batches])
-        look = render_poses(self._models, self._name, self._part, positions, quaternions, self._light)
+        tried = Pose.joined(*(Pose(b.positions[:, 0], b.quaternions[:, 0]) for b in batches))
+        look = render_poses(self._models, self._name, self._part, tried, self._light)
         losses = masked_loss(look, self._part, any_brightness=self._any_brightness)
         for search, own in zip(self._searches, losses.reshape(len(batches), -1), strict=True):
             search.tell(own)
-        return CMAGeneration(Pose(positions, quaternions), float(losses.min()), self._searches[0].sigma)
+        return tried, float(losses.min())
 
     def best_poses(self) -> Pose:
         """The starts, and the mean of each search."""
         now = [g.updated(s.mean) for g, s in zip(self._guesses, self._searches, strict=True)]
-        return Pose(
-            np.concatenate([self._starts.positions, *(g.positions for g in now)]),
-            np.concatenate([self._starts.quaternions, *(g.quaternions for g in now)]),
-        )
+        return Pose.joined(self._starts, *(Pose(g.positions, g.quaternions) for g in now))
 
 
-# Whether pictures show the table as it is known, from its pixels alone: a check before any estimate.
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneGeneration:
+    """One generation of a search for a scene.
+
+    Attributes:
+        best: the best scene so far, and
+        loss: its photometric loss.
+        tried: poses of the C candidates, a batch for each object.
+        lights: directions toward the light of the candidates.
+        sigma: the search's overall step, 1 at the beginning.
+    """
+
+    best: SceneParameters
+    loss: float
+    tried: list[Pose]
+    lights: Float[np.ndarray, "C 3"]
+    sigma: float
+
+
+def search_scene(
+    models: ObjectModels,
+    views: ObservedViews,
+    start: SceneParameters,
+    scales: Float[np.ndarray, "P"],
+    *,
+    population: int,
+    generations: int,
+    rng: np.random.Generator,
+) -> Iterator[SceneGeneration]:
+    """Minimise the photometric loss around a guess by CMA-ES.
+
+    Args:
+        models: fields.
+        views: what was observed, whole images or windows.
+        start: the guess; it is a candidate of every generation.
+        scales: first standard deviation of each number of the parameter vector; 0 holds a number still.
+        population: candidates per generation, besides the guess.
+        generations: how many.
+        rng: of the search.
+
+    Yields:
+        Each generation.
+    """
+    search, best, least = CMAES(scales, population, rng), start, np.inf
+    for _ in range(generations):
+        batch = start.perturbed(np.concatenate([np.zeros((1, start.size)), search.ask()]))
+        losses = photometric_loss(residuals(models, views, batch))
+        search.tell(losses[1:])
+        k = int(np.argmin(losses))
+        if losses[k] < least:
+            least, found = float(losses[k]), (batch.positions[k], batch.quaternions[k], batch.lights[k])
+            best = replace(start, positions=found[0], quaternions=found[1], light=found[2])
+        tried = [Pose(batch.positions[:, n], batch.quaternions[:, n]) for n in range(len(start.names))]
+        yield SceneGeneration(best, least, tried, batch.lights, search.sigma)
+
+
+# Light search: the direction toward the light by coarse-to-fine grid search, given roughly known poses.
 #
-# Every pixel of the known table obeys I_c = albedo_c (ambient + x direct), with x = 0 in shadow and the same x
-# where the lamp reaches it. Another exposure, response or ambient light moves the shadows away from x = 0, another
-# table changes the colours. Where no shadow is seen, as under a lamp overhead, only colours tell.
+# A grid over the hemisphere and a ring at the elevation that the table's shading gives, then shrinking 3 x 3 grids
+# around the best directions, ranked by the truncated absolute error mean(min(|r|, e_max)) of renderings with
+# shadows. Lit parts of the table reflect ambient + direct * sin(elevation); cast shadows give the azimuth; neither
+# needs accurate poses. Without the ring lights near the horizon are missed: there shading changes by half from one
+# direction to the next. The fit of unknown exposure (`photometry.py`) shares the grid and its refinement, but not
+# the error: there gains are solved for at each direction.
 
 
-TableVerdict = Literal["usual", "unclear", "other"]
-_MASK_ERROR_PX, _BESIDE = 2, 0.02  # of masks, and of the image's side: where nothing is table for sure
-_FEWEST = 200  # pixels of table, without which nothing is told
-_DARKEST = 0.001, 0.003  # shares of the pixels; where both lie well in shadow, it is as dark everywhere
-_SAME = 0.025  # difference of x within a shadow
-_SHADOW, _BRIGHTEST = 0.05, 1.06  # |x| in shadow, and x in full light
-_LEAST_CONTRAST = 0.05  # of x: less is noise, not a shadow
-_COLOUR = 0.012  # median error of colours [radiance]
+_DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
+_AZIMUTHS = 48  # of a ring at the horizon; higher ones are shorter
+FIRST_STEP_RAD = np.deg2rad(8.0)
+LIGHT_ROUNDS, SHRINKING = 6, 0.6  # of the step from round to round
+_MAX_ERROR = 0.25  # e_max [radiance]: orientations may still be wrong
+_FIRST_SURVIVORS, _SURVIVORS = 6, 3  # local minima arise where shadows fall on other objects
+_NEIGHBOUR_OFFSETS = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
+TABLE_COLOUR = 0.012  # error of a pixel's colours up to which it shows the table [radiance]
 _LIT, _FEWEST_LIT = 0.03, 20  # least x of a lit pixel, and how many each picture needs
 
 
-@dataclass(frozen=True, slots=True)
-class TableCheck:
-    """What pixels of the table tell.
-
-    Attributes:
-        shadow: x of the darkest; 0 on the known table under the known ambient light.
-        brightest: x of the brightest.
-        colour: median error of the colours [radiance].
-        verdict: "usual", or "other" where something speaks against the usual image model; "unclear" where no full
-            shadow is seen: then another lamp may explain what another exposure does.
-    """
-
-    shadow: float
-    brightest: float
-    colour: float
-    verdict: TableVerdict
-
-
-def check_table(models: ObjectModels, views: ObservedViews) -> TableCheck:
-    """Compare the table's pixels with the known table.
+def search_light(
+    models: ObjectModels, coarse: ObservedViews, fine: ObservedViews, params: SceneParameters
+) -> Float[np.ndarray, "3"]:
+    """Find the light under which a rendering of the guessed poses fits the images best.
 
     Args:
-        models: of which the table is used.
-        views: pictures with masks.
+        models: fields.
+        coarse: images to try the whole hemisphere on.
+        fine: images to refine on.
+        params: objects and pusher; its light plays no part.
+
+    Returns:
+        The unit vector toward it.
     """
-    x, error, on_table = table_light(models, views)
-    table = _table_pixels(views, on_table)
-    if table.sum() < _FEWEST:
-        return TableCheck(0.0, 0.0, 0.0, "unclear")
-    darkest, shadow, brightest = np.quantile(x[table], [*_DARKEST, 0.99])
-    colour = float(np.median(error[table]))
-    has_shadow = brightest - shadow > _LEAST_CONTRAST and shadow - darkest < _SAME
-    is_dark = abs(shadow) < _SHADOW if has_shadow else darkest > -_SHADOW
-    is_usual = is_dark and brightest < _BRIGHTEST and colour < _COLOUR
-    verdict: TableVerdict = "other" if not is_usual else "usual" if has_shadow else "unclear"
-    return TableCheck(float(shadow), float(brightest), colour, verdict)
+    directions = np.concatenate([hemisphere(), _ring(models, fine)])
+    best = directions[np.argsort(_losses(models, coarse, params, directions))[:_FIRST_SURVIVORS]]
+    step = FIRST_STEP_RAD
+    for _ in range(LIGHT_ROUNDS):
+        tried = np.concatenate([light_neighbours(params, light, step) for light in best])
+        best = tried[np.argsort(_losses(models, fine, params, tried))[:_SURVIVORS]]
+        step *= SHRINKING
+    return best[0]
+
+
+def light_loss_ratio(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
+    """Least truncated error on the grid over the hemisphere, divided by the error under the guess's own light.
+
+    Args:
+        models: fields.
+        views: images to compare with; coarse ones will do.
+        params: the guess.
+    """
+    directions = np.concatenate([params.light[None], hemisphere()])
+    losses = _losses(models, views, params, directions)
+    return float(losses[1:].min() / max(losses[0], 1e-12))
+
+
+def hemisphere(count: int = _DIRECTIONS) -> Float[np.ndarray, "K 3"]:
+    """Return those of `count` directions, spread over the whole sphere, that are high enough for a light."""
+    directions = fibonacci_sphere(count)
+    return directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
+
+
+def _ring(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray, "K 3"]:
+    """Return directions from all around at the elevation of the table's lit pixels; none where none is seen."""
+    level = lit_table_level(models, views)
+    if level is None:
+        return np.zeros((0, 3))
+    elevation = np.arcsin(np.clip(level, np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG)), 1))
+    count = int(np.ceil(_AZIMUTHS * np.cos(elevation))) + 1
+    azimuths = 2 * np.pi * np.arange(count) / count
+    return np.stack([Light.from_angles(azimuth, elevation).direction for azimuth in azimuths])
+
+
+def light_neighbours(params: SceneParameters, light: Float[np.ndarray, "3"], step: float) -> Float[np.ndarray, "9 3"]:
+    """Return a direction toward the light and eight around it, `step` [rad] apart.
+
+    Args:
+        params: any scene, of which only the size of the parameter vector plays a part.
+        light: the direction in the middle, a unit vector.
+        step: of the grid [rad].
+    """
+    changes = np.zeros((len(_NEIGHBOUR_OFFSETS), params.size))
+    changes[:, -LIGHT:] = step * _NEIGHBOUR_OFFSETS
+    return replace(params, light=light).perturbed(changes).lights
+
+
+def _losses(
+    models: ObjectModels, views: ObservedViews, params: SceneParameters, lights: np.ndarray
+) -> Float[np.ndarray, "B"]:
+    batch = replace(params.repeated(len(lights)), lights=lights)
+    rendered = models.together.render(batch, views.cameras, quality=QUALITY)
+    return np.minimum(np.abs(rendered.rgb - views.images), _MAX_ERROR).mean(axis=(1, 2, 3, 4))
 
 
 def table_light(
     models: ObjectModels, views: ObservedViews
 ) -> tuple[Float[np.ndarray, "V h w"], Float[np.ndarray, "V h w"], Bool[np.ndarray, "V h w"]]:
-    """What would be the light on the table, if every pixel showed it.
+    """Fit the light on the table to each pixel, as if every pixel showed it.
 
     Args:
         models: of which the table is used.
@@ -530,8 +604,7 @@ def table_light(
         x by which the pixel's radiance is best explained, the error of its colours that this leaves [radiance], and
         whether the table would be seen if it were empty.
     """
-    nothing = SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), OVERHEAD[None], None)
-    empty = models.together.render(nothing, views.cameras, quality=QUALITY, outputs={"rgb", "depth"})
+    empty = models.together.render(empty_scene(OVERHEAD), views.cameras, quality=QUALITY, outputs={"rgb", "depth"})
     assert empty.depth is not None
     full = empty.rgb[0]
     seen = np.stack([cv2.blur(image, (3, 3)) for image in views.images])
@@ -542,7 +615,7 @@ def table_light(
 
 
 def lit_table_level(models: ObjectModels, views: ObservedViews) -> float | None:
-    """Light x = sin(elevation) on the table where the lamp reaches it: the median over pixels of its colours.
+    """Measure the light x = sin(elevation) on the table where the lamp reaches it: the median over its pixels.
 
     Args:
         models: of which the table is used.
@@ -552,35 +625,8 @@ def lit_table_level(models: ObjectModels, views: ObservedViews) -> float | None:
         x, or None where too little of a lit table is seen.
     """
     x, error, on_table = table_light(models, views)
-    lit = x[on_table & (error < _COLOUR) & (x > _LIT)]
+    lit = x[on_table & (error < TABLE_COLOUR) & (x > _LIT)]
     return float(np.median(lit)) if len(lit) >= _FEWEST_LIT * len(views.images) else None
-
-
-def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:
-    """Pixels that show nothing but table, well within its edge."""
-    reach = _MASK_ERROR_PX + round(_BESIDE * max(on_table.shape[1:]))
-    kernel = np.ones((2 * reach + 1,) * 2, np.uint8)
-    other = ~on_table
-    if views.masks is not None and views.masks.shape[1]:
-        other |= views.masks.max(axis=1) > 0
-    if views.pusher is not None:
-        other |= _pusher_pixels(views)
-    return np.stack([cv2.dilate(part.astype(np.uint8), kernel) == 0 for part in other])
-
-
-def _pusher_pixels(views: ObservedViews) -> np.ndarray:
-    """The pusher's outline in each view, about, from points of its axis."""
-    assert views.pusher is not None
-    shown = np.zeros(views.images.shape[:3], np.uint8)
-    axis = views.pusher + np.linspace(-0.5, 0.5, 9)[:, None] * [0.0, 0.0, PUSHER_HEIGHT_M]
-    for picture, camera in zip(shown, views.cameras, strict=True):
-        depth = camera.T_world_camera.inverse().apply(axis)[:, 2]
-        if depth.min() <= PUSHER_RADIUS_M:
-            continue
-        radius = int(np.ceil(camera.intrinsics[0, 0] * PUSHER_RADIUS_M / depth.min()))
-        for x, y in camera.project(axis):
-            cv2.circle(picture, (int(x), int(y)), radius, 1, -1)
-    return shown > 0
 
 
 # Builds the steps that an estimator yields.
@@ -607,7 +653,7 @@ class StepReporter:
         lights: Float[np.ndarray, "C 3"] | None = None,
         loss: float = float("nan"),
     ) -> EstimateStep:
-        """The next step.
+        """Build the next step.
 
         Args:
             stage: which part of the method is at work.
@@ -631,97 +677,20 @@ class StepReporter:
         return EstimateStep(progress, stage, params.state(), candidates, lights, sigma, tuple(losses), loss)
 
     def refinement(self, note: str, at: GaussNewtonState) -> EstimateStep:
-        """The next step, of Gauss-Newton."""
+        """Build the next step, of Gauss-Newton."""
         return self.step("polish", note, at.params, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
 
+    def refinements(
+        self, note: str, at: GaussNewtonState, sweeps: Iterator[GaussNewtonState]
+    ) -> Generator[EstimateStep, None, GaussNewtonState]:
+        """Build a step from each sweep of Gauss-Newton that began at `at`; return where it ended."""
+        for sweep in sweeps:
+            at = sweep
+            yield self.refinement(note, at)
+        return at
+
     def finish(self, at: GaussNewtonState, estimate: EstimatedState) -> EstimateStep:
-        """The last step, with the result."""
+        """Build the last step, with the result."""
         self.done = self.total - 1
         step = self.refinement("Done" if estimate.trusted else estimate.reason, at)
         return replace(step, stage="done", estimate=estimate)
-
-
-# Light search: the direction toward the light by coarse-to-fine grid search, given roughly known poses.
-#
-# A grid over the hemisphere and a ring at the elevation that the table's shading tells, then shrinking 3 x 3 grids
-# around the best directions, ranked by the truncated absolute error mean(min(|r|, e_max)) of renderings with
-# shadows. Lit parts of the table reflect ambient + direct * sin(elevation); cast shadows tell the azimuth; neither
-# needs accurate poses. Without the ring lights near the horizon are missed: there shading changes by half from one
-# direction to the next.
-
-
-_DIRECTIONS = 300  # over the whole sphere: about 12 degrees apart
-_AZIMUTHS = 48  # of a ring at the horizon; higher ones are shorter
-_FIRST_STEP_RAD = np.deg2rad(8.0)
-_ROUNDS, _SHRINKING = 6, 0.6  # of the step from round to round
-_MAX_ERROR = 0.25  # e_max [radiance]: orientations may still be wrong
-_FIRST_SURVIVORS, _SURVIVORS = 6, 3  # local minima arise where shadows fall on other objects
-_NEIGHBOUR_OFFSETS = np.array([(a, b) for a in (0, -1, 1) for b in (0, -1, 1)], float)
-
-
-def search_light(
-    models: ObjectModels, coarse: ObservedViews, fine: ObservedViews, params: SceneParameters
-) -> Float[np.ndarray, "3"]:
-    """Unit vector toward the light under which a rendering of the guessed poses fits the images best.
-
-    Args:
-        models: fields.
-        coarse: images to try the whole hemisphere on.
-        fine: images to refine on.
-        params: objects and pusher; its light plays no part.
-
-    Returns:
-        The direction.
-    """
-    directions = np.concatenate([hemisphere(), _ring(models, fine)])
-    best = directions[np.argsort(_losses(models, coarse, params, directions))[:_FIRST_SURVIVORS]]
-    step = _FIRST_STEP_RAD
-    for _ in range(_ROUNDS):
-        tried = np.concatenate([_neighbours(params, light, step) for light in best])
-        best = tried[np.argsort(_losses(models, fine, params, tried))[:_SURVIVORS]]
-        step *= _SHRINKING
-    return best[0]
-
-
-def light_loss_ratio(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
-    """Least truncated error on the grid over the hemisphere, divided by the error under the guess's own light.
-
-    Args:
-        models: fields.
-        views: images to compare with; coarse ones will do.
-        params: the guess.
-    """
-    directions = np.concatenate([params.light[None], hemisphere()])
-    losses = _losses(models, views, params, directions)
-    return float(losses[1:].min() / max(losses[0], 1e-12))
-
-
-def hemisphere(count: int = _DIRECTIONS) -> Float[np.ndarray, "K 3"]:
-    """Where a light may be: those of `count` directions, spread over the whole sphere, that are high enough."""
-    directions = fibonacci_sphere(count)
-    return directions[directions[:, 2] > np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))]
-
-
-def _ring(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray, "K 3"]:
-    """Directions from all around at the elevation that the table's lit pixels tell; none where none is seen."""
-    level = lit_table_level(models, views)
-    if level is None:
-        return np.zeros((0, 3))
-    elevation = np.arcsin(np.clip(level, np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG)), 1))
-    count = int(np.ceil(_AZIMUTHS * np.cos(elevation))) + 1
-    azimuths = 2 * np.pi * np.arange(count) / count
-    return np.stack([Light.from_angles(azimuth, elevation).direction for azimuth in azimuths])
-
-
-def _neighbours(params: SceneParameters, light: np.ndarray, step: float) -> Float[np.ndarray, "9 3"]:
-    changes = np.zeros((len(_NEIGHBOUR_OFFSETS), params.size))
-    changes[:, -LIGHT:] = step * _NEIGHBOUR_OFFSETS
-    return replace(params, light=light).perturbed(changes).lights
-
-
-def _losses(
-    models: ObjectModels, views: ObservedViews, params: SceneParameters, lights: np.ndarray
-) -> Float[np.ndarray, "B"]:
-    batch = replace(params.perturbed(np.zeros((len(lights), params.size))), lights=lights)
-    rendered = models.together.render(batch, views.cameras, quality=QUALITY)
-    return np.minimum(np.abs(rendered.rgb - views.images), _MAX_ERROR).mean(axis=(1, 2, 3, 4))

@@ -1,4 +1,4 @@
-"""What estimators and checks of a photo's content return; apart from them, so that reading it loads no model."""
+"""Results of estimators and of checks of a photo's content; apart from them, so that importing it loads no model."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from osfcore.estimation.camera_response import ImageModel
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.progress import Progress
-
-# What an estimator yields while it works.
-
 
 UNPLACED_BELOW_M = -0.5  # an object that was not looked at yet is put far below the table
 Stage = Literal["orientations", "light", "objects", "together", "polish", "done"]
@@ -51,7 +48,7 @@ class EstimateStep:
 
 
 def all_but_last(steps: Iterator[EstimateStep]) -> Generator[EstimateStep, None, EstimateStep]:
-    """Steps of an estimate but for the last one, which is returned."""
+    """Pass on the steps of an estimate but for the last one, which is returned."""
     before = next(steps)
     for step in steps:
         yield before
@@ -59,15 +56,12 @@ def all_but_last(steps: Iterator[EstimateStep]) -> Generator[EstimateStep, None,
     return before
 
 
-# What a check of a photo's content answers; apart from the check, so that whoever asks need not load its models.
-
-
 Verdict = Literal["shown", "doubtful", "others", "bare", "elsewhere"]
 
 
 @dataclass(frozen=True, slots=True)
 class ContentCheck:
-    """What a photo shows.
+    """Result of a check of a photo's content.
 
     Attributes:
         verdict: "shown" if the objects are in it, "doubtful" if they may be, "others" if something else is, "bare" if

@@ -1,7 +1,7 @@
 """Later frames: no masks, started from the last estimate or from a predicted state (paper section 4.2, last part).
 
 Objects whose photometric residual stays small are refined by Gauss-Newton from where they were expected. The others are
-searched in order of cost: along the pusher's motion (`motion_hypotheses`), by CMA-ES with a small spread, and in their
+searched in order of cost: along the pusher's motion (`push_hypotheses`), by CMA-ES with a small spread, and in their
 other resting orientations. Fine images decide about yaw, since coarse ones do not resolve labels. The light is held
 unless the table's own residual grows and another light lowers it: then the lamp was moved and is searched again.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.hypotheses import compare_orientations, pose_losses, with_pose, yaw_hypotheses
+from osfcore.estimation.hypotheses import compare_orientations, yaw_hypotheses
 from osfcore.estimation.objective import (
     FINE_SIDE,
     POSE,
@@ -27,17 +27,18 @@ from osfcore.estimation.objective import (
     crop_to_silhouette,
     loss_of,
     photometric_loss,
+    pose_losses,
     residuals,
     views_of,
     yaw_quaternions,
 )
 from osfcore.estimation.search import (
-    CMAES,
     GaussNewtonState,
     StepReporter,
     gauss_newton,
     light_loss_ratio,
     search_light,
+    search_scene,
 )
 from osfcore.estimation.steps import EstimateStep, Stage
 from osfcore.estimation.uncertainty import (
@@ -50,139 +51,6 @@ from osfcore.estimation.uncertainty import (
 )
 from osfcore.geometry.poses import Pose, quaternion_conjugate, quaternion_exp, quaternion_multiply, rotate
 from osfcore.geometry.states import Observation, SceneState
-
-# Motion hypotheses: poses that an object may have after a push, as starts of a search; their photometric loss
-# decides.
-#
-# An object moves by a share of the pusher's motion, alone or with others, and keeps its orientation, turns about
-# the vertical, or rolls without slipping. Fast and deliberately coarse: not a dynamics model.
-
-
-_SHARES = (0.0, 0.5, 1.0)  # of the push, by which each of several objects may have moved
-_MAX_COMBINED = 4  # objects whose shares are combined in all ways; of more, all have the same
-_NEAR_M = 0.02  # search radius where there was no push
-_ALONG = np.array([-0.3, 0.0, 0.3])  # shares of the push, around where an object is guessed
-_ACROSS = np.array([-0.25, 0.0, 0.25])
-_TURNS_RAD = np.array([-0.5, 0.0, 0.5])
-_MIN_PUSH_M = 0.005
-_DOWN = np.array([0.0, 0.0, -1.0])
-_ROLLED_RAD = np.deg2rad([20.0, 40.0, 60.0, 80.0])  # at which it is checked that a body can roll
-_OBLIQUE_RAD = np.deg2rad([0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0])  # of an axis to the one square to a push
-_ROLLS = 18  # equal steps of a whole roll
-_ROLLING_RAD = np.deg2rad(15.0)  # from an orientation in which it can lie
-
-
-def joint_push_hypotheses(
-    params: SceneParameters, numbers: Sequence[int], push: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "K N 3"]:
-    """Positions of all objects if some were moved by shares of a push, K combinations; the first is the guess's [m].
-
-    Args:
-        params: the guess.
-        numbers: of the objects that may have moved; up to four are combined in all ways, more move by one share.
-        push: motion of the pusher [m].
-    """
-    if len(numbers) <= _MAX_COMBINED:
-        shares = np.array(list(product(_SHARES, repeat=len(numbers))))
-    else:
-        shares = np.tile(np.array(_SHARES)[:, None], (1, len(numbers)))
-    positions = np.repeat(params.positions[None], len(shares), axis=0)
-    positions[:, list(numbers)] += shares[..., None] * push
-    return positions
-
-
-def push_hypotheses(models: ObjectModels, params: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
-    """Poses of one object on a grid along and across a push, times yaw angles, and rolled; a batch.
-
-    Args:
-        models: fields, for the object's centre of mass and how it can roll.
-        params: the guess, around which the grid lies.
-        number: of the object.
-        push: motion of the pusher [m]; under 5 mm the grid covers about 2 cm around the guess, and nothing rolls.
-    """
-    length = float(np.linalg.norm(push))
-    step = push if length > _MIN_PUSH_M else np.array([_NEAR_M / _ALONG[-1], 0.0, 0.0])
-    beside = np.array([-step[1], step[0], 0.0])
-    shifts = (_ALONG[:, None, None] * step + _ACROSS[:, None] * beside).reshape(-1, 3)
-    turns = yaw_quaternions(_TURNS_RAD)
-    slid = [(shift, turn) for shift in shifts for turn in turns]
-    axis = _rolling_axis(models, params, number, push)
-    rolled = (
-        [(shift, _roll_along(models, params, number, axis, push + shift)) for shift in shifts] if axis.any() else []
-    )
-    return _combine_shifts_and_turns(models, params, number, *map(np.array, zip(*slid, *rolled, strict=True)))
-
-
-def rolling_hypotheses(
-    models: ObjectModels, params: SceneParameters, number: int, push: Float[np.ndarray, "3"]
-) -> Pose:
-    """Poses of one object turned about the axis about which a push rolls it, its own first; a batch.
-
-    Args:
-        models: fields, for the object's centre of mass and how it can roll.
-        params: the guess; the object's centre of mass stays.
-        number: of the object.
-        push: motion of the pusher [m]; if it cannot roll the object, only its own pose is returned.
-    """
-    axis = _rolling_axis(models, params, number, push)
-    angles = np.arange(_ROLLS if axis.any() else 1) * 2 * np.pi / _ROLLS
-    return _combine_shifts_and_turns(
-        models, params, number, np.zeros((len(angles), 3)), quaternion_exp(angles[:, None] * axis)
-    )
-
-
-def resting_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
-    """Poses of one object in all its resting orientations; a batch.
-
-    Args:
-        models: fields, for how the object can lie.
-        params: the guess; the centre of mass stays above the same point of the table.
-        number: of the object.
-    """
-    resting = models.resting(params.names[number])
-    centre = params.positions[number] + rotate(params.quaternions[number], resting.centre)
-    centres = np.column_stack([np.tile(centre[:2], (len(resting.heights), 1)), resting.heights])
-    return Pose(centres - rotate(resting.quaternions, resting.centre), resting.quaternions)
-
-
-def _rolling_axis(
-    models: ObjectModels, params: SceneParameters, number: int, push: np.ndarray
-) -> Float[np.ndarray, "3"]:
-    """Unit vector about which a push rolls a body forward, the one nearest to square to the push; zero if none.
-
-    A body can roll about an axis if it can rest in every orientation on the way.
-    """
-    length = float(np.linalg.norm(push))
-    if length < _MIN_PUSH_M:
-        return np.zeros(3)
-    resting, now = models.resting(params.names[number]), params.quaternions[number]
-    lying = rotate(quaternion_conjugate(resting.quaternions), _DOWN)
-    for axis in rotate(yaw_quaternions(_OBLIQUE_RAD), np.array([-push[1], push[0], 0.0]) / length):
-        rolled = quaternion_multiply(quaternion_exp(_ROLLED_RAD[:, None] * axis), now[None])
-        down = rotate(quaternion_conjugate(rolled), _DOWN)
-        if ((down @ lying.T).max(axis=1) > np.cos(_ROLLING_RAD)).all():
-            return axis
-    return np.zeros(3)
-
-
-def _roll_along(
-    models: ObjectModels, params: SceneParameters, number: int, axis: np.ndarray, path: np.ndarray
-) -> Float[np.ndarray, "4"]:
-    """The rotation of a body that rolls along a path without slipping, its centre as high as it is now."""
-    resting = models.resting(params.names[number])
-    height = params.positions[number, 2] + rotate(params.quaternions[number], resting.centre)[2]
-    forward = np.array([axis[1], -axis[0], 0.0])
-    return quaternion_exp(axis * (forward @ path) / max(float(height), 0.25 * resting.radius))
-
-
-def _combine_shifts_and_turns(
-    models: ObjectModels, params: SceneParameters, number: int, shifts: np.ndarray, turns: np.ndarray
-) -> Pose:
-    """One object shifted, and turned about its centre of mass."""
-    centre, now = models.resting(params.names[number]).centre, params.quaternions[number]
-    quaternions = quaternion_multiply(turns, now[None])
-    middle = params.positions[number] + rotate(now, centre) + shifts
-    return Pose(middle - rotate(quaternions, centre), quaternions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,11 +176,11 @@ class _Tracker:
         yield self._finish(at)
 
     def _fit_at_half_size(self, params: SceneParameters) -> FitQuality:
-        """How well a guess explains the images of half resolution."""
+        """Evaluate how well a guess explains the images of half resolution."""
         return evaluate_fit(self._models, self._middle, params)
 
     def _poorly_fitted(self, params: SceneParameters) -> Bool[np.ndarray, "N"]:
-        """Which objects have a residual above what is allowed."""
+        """Find the objects whose residual is above what is allowed."""
         return object_residuals(self._fit_at_half_size(params)) > np.maximum(self._config.fits_below, self._allowed)
 
     def _search_light(self, at: GaussNewtonState) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
@@ -330,21 +198,16 @@ class _Tracker:
         self, at: GaussNewtonState, moving: Bool[np.ndarray, "N"], views: ObservedViews, sweeps: int
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         objects = np.flatnonzero(moving).tolist()
-        for step in gauss_newton(self._models, views, at, iterations=sweeps, objects=objects, until_settled=True):
-            at = step
-            yield self._step("polish", "The last millimetres", at)
-        return at
+        refined = gauss_newton(self._models, views, at, iterations=sweeps, objects=objects, until_settled=True)
+        return (yield from self._reporter.refinements("The last millimetres", at, refined))
 
     def _refine_coarse_to_fine(
         self, at: GaussNewtonState, moving: Bool[np.ndarray, "N"]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Gauss-Newton from coarse to fine images."""
+        """Refine by Gauss-Newton from coarse to fine images."""
         e = self._config
         for views, sweeps in ((self._rough, e.rough_sweeps), (self._coarse, e.sweeps), (self._middle, e.fine_sweeps)):
-            at = replace(
-                at, dampings=GaussNewtonState.at(at.params).dampings
-            )  # old ones tell nothing of where it is now
-            at = yield from self._refine(at, moving, views, sweeps)
+            at = yield from self._refine(at.undamped(), moving, views, sweeps)
         return at
 
     def _try_pushes(
@@ -357,7 +220,7 @@ class _Tracker:
             views = crop_to_object(self._coarse, self._models, at.params, n, reach=self._config.reach)
             tried = push_hypotheses(self._models, at.params, n, self._push)
             losses = pose_losses(self._models, views, at.params, n, tried)
-            at = replace(at, params=with_pose(at.params, n, tried[int(losses.argmin())]))
+            at = replace(at, params=at.params.with_pose(n, tried[int(losses.argmin())]))
             at = replace(at, params=self._best_rolling_pose(at.params, n))
             yield self._step("together", f"{at.params.names[n]}: where it was pushed", at)
         return at
@@ -365,16 +228,28 @@ class _Tracker:
     def _search(
         self, at: GaussNewtonState, misfit: Bool[np.ndarray, "N"]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """CMA-ES over the pose of each poorly fitted object."""
+        """Search the pose of each poorly fitted object by CMA-ES, in a window around it."""
+        e = self._config
         for n in np.flatnonzero(misfit).tolist():
-            views = crop_to_object(self._coarse, self._models, at.params, n, reach=self._config.reach)
-            at = yield from self._search_object(at, n, views)
+            views = crop_to_object(self._coarse, self._models, at.params, n, reach=e.reach)
+            scales = np.zeros(at.params.size)
+            scales[POSE * n : POSE * (n + 1)] = e.shift, e.shift, e.shift / 3, e.turn / 2, e.turn / 2, e.turn
+            search = search_scene(
+                self._models, views, at.params, scales,
+                population=e.population, generations=e.generations, rng=self._rng,
+            )  # fmt: skip
+            losses, note = at.losses[:-1].tolist(), f"{at.params.names[n]}: where it went"
+            for found in search:
+                at = replace(at, params=found.best)
+                yield self._reporter.step(
+                    "together", note, found.best, found.tried, losses, sigma=found.sigma, loss=found.loss
+                )
         return at
 
     def _best_joint_push(self, params: SceneParameters, numbers: list[int]) -> SceneParameters:
         """The guess with objects moved by the shares of the push that give the lowest photometric loss."""
         positions = joint_push_hypotheses(params, numbers, self._push)
-        batch = replace(params.perturbed(np.zeros((len(positions), params.size))), positions=positions)
+        batch = replace(params.repeated(len(positions)), positions=positions)
         best = int(photometric_loss(residuals(self._models, self._coarse, batch)).argmin())
         return replace(params, positions=positions[best])
 
@@ -384,37 +259,14 @@ class _Tracker:
         if len(tried.position) == 1:
             return params
         losses = pose_losses(self._models, crop_to_object(self._middle, self._models, params, n), params, n, tried)
-        return with_pose(params, n, tried[int(losses.argmin())])
-
-    def _search_object(
-        self, at: GaussNewtonState, n: int, views: ObservedViews
-    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """CMA over one object's pose."""
-        e, start = self._config, at.params
-        spread = np.array([e.shift, e.shift, e.shift / 3, e.turn / 2, e.turn / 2, e.turn])
-        search = CMAES(spread, e.population, self._rng)
-        best, least = start, np.inf
-        for _ in range(e.generations):
-            changes = np.zeros((1 + e.population, start.size))
-            changes[1:, POSE * n : POSE * (n + 1)] = search.ask()
-            batch = start.perturbed(changes)
-            losses = photometric_loss(residuals(self._models, views, batch))
-            search.tell(losses[1:])
-            k = int(np.argmin(losses))
-            if losses[k] < least:
-                least, best = float(losses[k]), start.updated(changes[k])
-            step = self._step("together", f"{start.names[n]}: where it went", replace(at, params=best))
-            yield replace(step, candidates=Pose(batch.positions, batch.quaternions), sigma=search.sigma, loss=least)
-        return replace(at, params=best)
+        return params.with_pose(n, tried[int(losses.argmin())])
 
     def _recover(
         self, at: GaussNewtonState, misfit: Bool[np.ndarray, "N"]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Try all resting orientations of poorly fitted objects, at their present and at their expected position."""
         for n in np.flatnonzero(misfit).tolist():
-            others = Pose.joined(
-                *(resting_hypotheses(self._models, params, n) for params in (at.params, self._initial))
-            )
+            others = Pose.joined(*(resting_hypotheses(self._models, one, n) for one in (at.params, self._initial)))
             at = self._compare_orientations(at, n, others)
             yield self._step("together", f"{at.params.names[n]}: lying in another way", at)
         return at
@@ -445,11 +297,9 @@ class _Tracker:
         return self._last_fit[1]
 
     def _may_be_turned(self, params: SceneParameters, n: int, others: Pose) -> bool:
-        """Whether the loss of some other yaw is within a factor of the present one's."""
-        tried = Pose.joined(params.state().poses[n][None], others)
-        here, *there = pose_losses(
-            self._models, crop_to_silhouette(self._sharp, self._models, params, n), params, n, tried
-        )
+        """Decide whether the loss of some other yaw is within a factor of the present one's."""
+        views = crop_to_silhouette(self._sharp, self._models, params, n)
+        here, *there = pose_losses(self._models, views, params, n, Pose.joined(params.state().poses[n][None], others))
         return min(there) < self._config.turned_within * here
 
     def _compare_orientations(self, at: GaussNewtonState, n: int, others: Pose) -> GaussNewtonState:
@@ -471,7 +321,136 @@ class _Tracker:
 def _pusher_motion(
     before: Float[np.ndarray, "3"] | None, after: Float[np.ndarray, "3"] | None
 ) -> Float[np.ndarray, "3"]:
-    """How far the pusher went along the table; nothing if it was not there before or is not there now."""
+    """Return the pusher's motion along the table [m]; zero if it was not there before or is not there now."""
     if before is None or after is None:
         return np.zeros(3)
     return np.array([*(after - before)[:2], 0.0])
+
+
+# Motion hypotheses: poses that an object may have after a push, as starts of a search; their photometric loss
+# decides.
+#
+# An object moves by a share of the pusher's motion, alone or with others, and keeps its orientation, turns about
+# the vertical, or rolls without slipping. Fast and deliberately coarse: not a dynamics model.
+
+
+_SHARES = (0.0, 0.5, 1.0)  # of the push, by which each of several objects may have moved
+_MAX_COMBINED = 4  # objects whose shares are combined in all ways; of more, all have the same
+_NEAR_M = 0.02  # search radius where there was no push
+_ALONG = np.array([-0.3, 0.0, 0.3])  # shares of the push, around where an object is guessed
+_ACROSS = np.array([-0.25, 0.0, 0.25])
+_TURNS_RAD = np.array([-0.5, 0.0, 0.5])
+_MIN_PUSH_M = 0.005
+_DOWN = np.array([0.0, 0.0, -1.0])
+_ROLLED_RAD = np.deg2rad([20.0, 40.0, 60.0, 80.0])  # at which it is checked that a body can roll
+_OBLIQUE_RAD = np.deg2rad([0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0])  # of an axis to the one square to a push
+_ROLLS = 18  # equal steps of a whole roll
+_ROLLING_RAD = np.deg2rad(15.0)  # from an orientation in which it can lie
+
+
+def joint_push_hypotheses(
+    params: SceneParameters, numbers: Sequence[int], push: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "K N 3"]:
+    """Positions of all objects if some were moved by shares of a push, K combinations; the first is the guess's [m].
+
+    Args:
+        params: the guess.
+        numbers: of the objects that may have moved; up to four are combined in all ways, more move by one share.
+        push: motion of the pusher [m].
+    """
+    if len(numbers) <= _MAX_COMBINED:
+        shares = np.array(list(product(_SHARES, repeat=len(numbers))))
+    else:
+        shares = np.tile(np.array(_SHARES)[:, None], (1, len(numbers)))
+    positions = np.repeat(params.positions[None], len(shares), axis=0)
+    positions[:, list(numbers)] += shares[..., None] * push
+    return positions
+
+
+def push_hypotheses(models: ObjectModels, params: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
+    """Poses of one object on a grid along and across a push, times yaw angles, and rolled; a batch.
+
+    Args:
+        models: fields, for the object's centre of mass and how it can roll.
+        params: the guess, around which the grid lies.
+        number: of the object.
+        push: motion of the pusher [m]; under 5 mm the grid covers about 2 cm around the guess, and nothing rolls.
+    """
+    length = float(np.linalg.norm(push))
+    step = push if length > _MIN_PUSH_M else np.array([_NEAR_M / _ALONG[-1], 0.0, 0.0])
+    beside = np.array([-step[1], step[0], 0.0])
+    shifts = (_ALONG[:, None, None] * step + _ACROSS[:, None] * beside).reshape(-1, 3)
+    turns = yaw_quaternions(_TURNS_RAD)
+    slid = [(shift, turn) for shift in shifts for turn in turns]
+    axis = _rolling_axis(models, params, number, push)
+    rolled = []
+    if axis.any():
+        rolled = [(shift, _roll_along(models, params, number, axis, push + shift)) for shift in shifts]
+    return _combine_shifts_and_turns(models, params, number, *map(np.array, zip(*slid, *rolled, strict=True)))
+
+
+def rolling_hypotheses(
+    models: ObjectModels, params: SceneParameters, number: int, push: Float[np.ndarray, "3"]
+) -> Pose:
+    """Poses of one object turned about the axis about which a push rolls it, its own first; a batch.
+
+    Args:
+        models: fields, for the object's centre of mass and how it can roll.
+        params: the guess; the object's centre of mass stays.
+        number: of the object.
+        push: motion of the pusher [m]; if it cannot roll the object, only its own pose is returned.
+    """
+    axis = _rolling_axis(models, params, number, push)
+    angles = np.arange(_ROLLS if axis.any() else 1) * 2 * np.pi / _ROLLS
+    turns = quaternion_exp(angles[:, None] * axis)
+    return _combine_shifts_and_turns(models, params, number, np.zeros((len(angles), 3)), turns)
+
+
+def resting_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
+    """Poses of one object in all its resting orientations; a batch.
+
+    Args:
+        models: fields, for how the object can lie.
+        params: the guess; the centre of mass stays above the same point of the table.
+        number: of the object.
+    """
+    resting, centre = models.resting(params.names[number]), models.centre_of_mass(params, number)
+    centres = np.column_stack([np.tile(centre[:2], (len(resting.heights), 1)), resting.heights])
+    return resting.poses_at(centres, resting.quaternions)
+
+
+def _rolling_axis(
+    models: ObjectModels, params: SceneParameters, number: int, push: np.ndarray
+) -> Float[np.ndarray, "3"]:
+    """Unit vector about which a push rolls a body forward, the one nearest to square to the push; zero if none.
+
+    A body can roll about an axis if it can rest in every orientation on the way.
+    """
+    length = float(np.linalg.norm(push))
+    if length < _MIN_PUSH_M:
+        return np.zeros(3)
+    resting, now = models.resting(params.names[number]), params.quaternions[number]
+    lying = rotate(quaternion_conjugate(resting.quaternions), _DOWN)
+    for axis in rotate(yaw_quaternions(_OBLIQUE_RAD), np.array([-push[1], push[0], 0.0]) / length):
+        rolled = quaternion_multiply(quaternion_exp(_ROLLED_RAD[:, None] * axis), now[None])
+        down = rotate(quaternion_conjugate(rolled), _DOWN)
+        if ((down @ lying.T).max(axis=1) > np.cos(_ROLLING_RAD)).all():
+            return axis
+    return np.zeros(3)
+
+
+def _roll_along(
+    models: ObjectModels, params: SceneParameters, number: int, axis: np.ndarray, path: np.ndarray
+) -> Float[np.ndarray, "4"]:
+    """Return the rotation of a body that rolls along a path without slipping, its centre as high as it is now."""
+    height, radius = models.centre_of_mass(params, number)[2], models.resting(params.names[number]).radius
+    forward = np.array([axis[1], -axis[0], 0.0])
+    return quaternion_exp(axis * (forward @ path) / max(float(height), 0.25 * radius))
+
+
+def _combine_shifts_and_turns(
+    models: ObjectModels, params: SceneParameters, number: int, shifts: np.ndarray, turns: np.ndarray
+) -> Pose:
+    """Return poses of one object shifted, and turned about its centre of mass."""
+    quaternions = quaternion_multiply(turns, params.quaternions[number][None])
+    return models.resting(params.names[number]).poses_at(models.centre_of_mass(params, number) + shifts, quaternions)

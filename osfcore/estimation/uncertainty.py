@@ -16,7 +16,6 @@ from jaxtyping import Float, Float32
 from osfcore.estimation.objective import FINE_SIDE, LIGHT, POSE, ObjectModels, ObservedViews, SceneParameters, views_of
 from osfcore.estimation.search import difference_steps
 from osfcore.geometry.states import EstimatedState, Observation, SceneState
-from osfcore.render.types import SceneBatch
 
 # Calibrated on scenes that no reported figure uses.
 _POSITION_FACTOR = 15.0
@@ -33,7 +32,7 @@ _MIN_PIXELS = 12.0  # of an object in all views together
 _MOST_POSITION_STD_M, _MOST_ROTATION_STD_RAD = 0.005, np.deg2rad(2.5)
 _MIN_RIVAL_RATIO = 1.05
 # Loss of the best other orientation, over that of the one chosen, from which a residual of up to a share of the level
-# rather tells that the field errs; wrong poses reached 7.5.
+# rather shows that the field errs; wrong poses reached 7.5.
 SURE_RIVAL_RATIO, _SURE_SHARE = 12.0, 0.3
 AMBIGUOUS = "another orientation explains the images as well"  # a doubt
 _MAX_HEIGHT_M = 0.006  # of the lowest point over or under the table; truths were within -1 and 4 mm
@@ -70,8 +69,9 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParame
         views: what was observed; masks, where there are any, give the overlap of silhouettes.
         params: the guess.
     """
-    batch: SceneBatch = params.perturbed(np.zeros((1, params.size)))
-    rendered = models.together.render(batch, views.cameras, quality=views.quality, outputs={"rgb", "opacity"})
+    rendered = models.together.render(
+        params.repeated(), views.cameras, quality=views.quality, outputs={"rgb", "opacity"}
+    )
     assert rendered.opacity is not None
     opacity = rendered.opacity[0].astype(float)
     squares = ((rendered.rgb[0] - views.images) ** 2).mean(axis=-1, dtype=float)
@@ -92,7 +92,7 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParame
 def _brightness(
     opacity: Float[np.ndarray, "V N h w"], images: Float32[np.ndarray, "V h w 3"]
 ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """Contrast and level of each object."""
+    """Compute the contrast and the level of each object."""
     total = np.maximum(opacity.sum(axis=(0, 2, 3)), 1e-6)[:, None]
     first, second = (np.einsum("vnhw,vhwc->nc", opacity, images**power) / total for power in (1, 2))
     return np.sqrt(np.maximum(second - first**2, 0).mean(axis=-1)), np.sqrt(second.mean(axis=-1))
@@ -104,18 +104,18 @@ def relative_allowance(fit: FitQuality) -> Float[np.ndarray, "N"]:
 
 
 def object_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
-    """Root of mean square error of each object over its pixels in all views."""
+    """Return the root of the mean square error of each object over its pixels in all views [radiance]."""
     total = np.maximum(fit.pixels.sum(axis=0), 1e-6)
     return np.sqrt((fit.pixels * fit.residuals**2).sum(axis=0) / total)
 
 
 def relative_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
-    """Residuals of the objects as shares of their level: how bright the light is plays no part."""
+    """Return residuals as shares of the objects' levels: how bright the light is plays no part."""
     return object_residuals(fit) / np.maximum(fit.level, 1e-6)
 
 
 def expected_fit(models: ObjectModels, observation: Observation, state: SceneState) -> FitQuality:
-    """How well objects fit where they stand: fields err; what is normal here tells later what is not.
+    """Evaluate how well objects fit where they stand: fields err, and what is normal here is no doubt later.
 
     Args:
         models: fields of the objects and the table.
@@ -127,7 +127,7 @@ def expected_fit(models: ObjectModels, observation: Observation, state: SceneSta
 
 
 def expected_residuals(models: ObjectModels, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
-    """RMS residual of each object where it stands [radiance], see `expected_fit`."""
+    """Return the RMS residual of each object where it stands [radiance], see `expected_fit`."""
     return object_residuals(expected_fit(models, observation, state))
 
 
@@ -159,7 +159,7 @@ def estimate_with_uncertainty(
     lowest: Float[np.ndarray, "N"] | None = None,
     allowed: Float[np.ndarray, "N"] | None = None,
 ) -> EstimatedState:
-    """A guess with its uncertainty and the doubts about it.
+    """Make an estimate of a guess, with its uncertainty and the doubts about it.
 
     Args:
         params: what was found.
@@ -186,8 +186,12 @@ def estimate_with_uncertainty(
         _reason_for_doubt(fit, n, most[n], position[n], rotation[n], rivals.get(n, np.inf)) or _height_doubt(heights[n])
         for n in range(count)
     )
-    doubtful = [f"{name}: {doubt}" for name, doubt in zip(params.names, doubts, strict=True) if doubt]
-    return EstimatedState(params.state(), position, rotation, light, doubts, "; ".join(doubtful))
+    return EstimatedState(params.state(), position, rotation, light, doubts, reason_for(params.names, doubts))
+
+
+def reason_for(names: Sequence[str], doubts: Sequence[str]) -> str:
+    """Join the doubts about objects into one text, such as "mug: it is hardly visible"; "" if there are none."""
+    return "; ".join(f"{name}: {doubt}" for name, doubt in zip(names, doubts, strict=True) if doubt)
 
 
 def _spreads(fit: FitQuality) -> Float[np.ndarray, "B"]:
@@ -197,7 +201,7 @@ def _spreads(fit: FitQuality) -> Float[np.ndarray, "B"]:
 
 
 def _deviations(normals: Sequence[np.ndarray], spreads: Float[np.ndarray, "B"], count: int) -> np.ndarray:
-    """Standard deviations of all parameters; very large where the images do not constrain one."""
+    """Compute standard deviations of all parameters; very large where the images do not constrain one."""
     widths, found, start = difference_steps(count), [], 0
     for normal, spread in zip(normals, spreads, strict=True):
         own = widths[start : start + len(normal)]
@@ -233,7 +237,7 @@ def _misfit(fit: FitQuality, n: int, most: float) -> str:
 
 
 def misfits(fit: FitQuality, allowed: Float[np.ndarray, "N"]) -> list[int]:
-    """Numbers of the objects that the images do not show where they were rendered.
+    """Return numbers of the objects that the images do not show where they were rendered.
 
     Args:
         fit: of the guess.

@@ -81,7 +81,7 @@ TERMINAL_WEIGHT = 2.0  # of the last state, against the mean over the horizon
 
 
 class Cost(Protocol):
-    """What futures cost."""
+    """A cost of futures."""
 
     def __call__(self, rollouts: Rollouts) -> Float[np.ndarray, "K"]:
         """The cost of each sequence; less is better."""
@@ -127,7 +127,7 @@ class PoseGoal:
         return self.poses[[self.names.index(name) for name in names]]
 
     def offsets_m(self, state: SceneState) -> Float[np.ndarray, "N 2"]:
-        """How far each object has to go, horizontally, in the order of the state [m]."""
+        """Return how far each object has to go, horizontally, in the order of the state [m]."""
         return self.poses_of(state.names).position[:, :2] - state.poses.position[:, :2]
 
 

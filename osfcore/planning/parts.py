@@ -20,7 +20,7 @@ from osfcore.render.types import Renderer
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CostInputs:
-    """What a cost may compare futures with, and by what it may draw them.
+    """Inputs of a cost: what it may compare futures with, and a renderer to draw them.
 
     Attributes:
         goal: where everything should be.
@@ -39,7 +39,7 @@ class CostInputs:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlannerInputs:
-    """What a planner may ask.
+    """Inputs of a planner.
 
     Attributes:
         rollout: predicts futures: state, actions, and the state one action ago if known.
@@ -53,7 +53,7 @@ class PlannerInputs:
 
 
 class Planner(Protocol):
-    """What decides about actions: `MPPIPlanner` says what each method does.
+    """A planner of actions: `MPPIPlanner` says what each method does.
 
     Attributes:
         settings: replaced while an episode runs; the horizon shrinks to the actions that are left.
@@ -84,18 +84,13 @@ COST = PartKind("cost", ("__call__",))
 PLANNER = PartKind("planner", ("plan", "nominal", "shift", "reset"))
 
 
-def _pose_cost(given: CostInputs) -> Cost:
-    return PoseCost(given.goal)
-
-
-def _image_cost(given: CostInputs) -> Cost:
-    return ImageCost(given.renderer, given.camera, given.image, given.light)
-
-
 def mppi(given: PlannerInputs) -> Planner:
-    """Our planner."""
+    """Make our planner."""
     return MPPIPlanner(given.rollout, given.proposals, given.settings)
 
 
-COSTS: Mapping[str, Callable[[CostInputs], Cost]] = {"pose": _pose_cost, "image": _image_cost}
+COSTS: Mapping[str, Callable[[CostInputs], Cost]] = {
+    "pose": lambda given: PoseCost(given.goal),
+    "image": lambda given: ImageCost(given.renderer, given.camera, given.image, given.light),
+}
 PLANNERS: Mapping[str, Callable[[PlannerInputs], Planner]] = {"mppi": mppi}

@@ -50,11 +50,11 @@ class FreeSpace:
         self._free = self.clearance >= CLEARANCE_M
 
     def is_free(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Whether the disc clears everything at some places within the pusher's reach."""
+        """Decide whether the disc clears everything at some places within the pusher's reach."""
         return self.clearance_at(points) >= CLEARANCE_M
 
     def clearance_at(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Clearance at some places [m]; minus infinity beyond the pusher's reach."""
+        """Return the clearance at some places [m]; minus infinity beyond the pusher's reach."""
         cells = _cells(points)
         within = np.all((cells >= 0) & (cells < _SIDE), axis=1)
         rows = cells.clip(0, _SIDE - 1)
@@ -69,7 +69,7 @@ class FreeSpace:
         return np.where(self._free, 1.0, _BLOCKED)
 
     def has_line_of_sight(self, a: Int[np.ndarray, "2"], b: Int[np.ndarray, "2"]) -> bool:
-        """Whether the straight line between two cells is free, but for its ends."""
+        """Decide whether the straight line between two cells is free, but for its ends."""
         rows, columns = line(*a, *b)
         return bool(self._free[rows[1:-1], columns[1:-1]].all())
 
@@ -134,7 +134,7 @@ def actions_along(
 
 
 def _next_moment(corners: list[list[float]], times: list[float], now: float, here: list[float]) -> float:
-    """When the action that begins now ends [actions of the path's time]: after a whole one, or at a corner."""
+    """Find when the action that begins now ends [actions of the path's time]: after a whole one, or at a corner."""
     end = now + 1
     first, last = bisect_right(times, now), bisect_left(times, end)
     while last > first:
@@ -147,16 +147,12 @@ def _next_moment(corners: list[list[float]], times: list[float], now: float, her
 
 
 def _place_at(corners: list[list[float]], times: list[float], moment: float) -> list[float]:
-    """Where the path is at a moment; at its last corner after its end."""
+    """Return the place of the path at a moment; its last corner after its end."""
     after = bisect_right(times, moment)
     if after == len(times):
         return corners[-1]
-    begin, end, share = (
-        corners[after - 1],
-        corners[after],
-        (moment - times[after - 1]) / (times[after] - times[after - 1]),
-    )
-    return [a + share * (b - a) for a, b in zip(begin, end, strict=True)]
+    share = (moment - times[after - 1]) / (times[after] - times[after - 1])
+    return [a + share * (b - a) for a, b in zip(corners[after - 1], corners[after], strict=True)]
 
 
 def _distance_to_line(point: list[float], begin: list[float], end: list[float]) -> float:

@@ -80,10 +80,10 @@ def push_orders(
         now: where the objects are.
         goals: where they should be.
         off: numbers of those that are not there.
-        outlines: tells those of an object at a pose [m].
+        outlines: returns those of an object at a pose [m].
         count: of orders at most.
         rng: draws among possible ones.
-    """  # fmt: skip
+    """
     waits = _dependencies(now, goals, off, outlines)
     every = list(permutations(off)) if len(off) <= 6 else [tuple(rng.permutation(off)) for _ in range(_PERMUTATIONS)]
     possible = [order for order in every if _is_possible(order, waits, frozenset())]
@@ -99,7 +99,7 @@ def push_orders(
 def _dependencies(
     now: Sequence[Pose], goals: Sequence[Pose], off: Sequence[int], outlines: OutlinesAt
 ) -> dict[int, frozenset[int]]:
-    """For each object those that take its goal and will leave it."""
+    """Return for each object those that take its goal and will leave it."""
     taken = {n: FreeSpace(outlines(n, now[n]), 0.0).clearance < CLEARANCE_M for n in off}
     wanted = {n: FreeSpace(outlines(n, goals[n]), 0.0).clearance <= 0 for n in off}
     return {n: frozenset(other for other in off if other != n and np.any(wanted[n] & taken[other])) for n in off}
@@ -118,7 +118,7 @@ def _with_buffers(
     now: Sequence[Pose], goals: Sequence[Pose], every: Sequence[tuple[int, ...]], waits: dict[int, frozenset[int]],
     outlines: OutlinesAt, count: int, rng: np.random.Generator,
 ) -> Iterator[tuple[Stage, ...]]:  # fmt: skip
-    """Orders that begin with one object's way to a buffer; without any such, plain ones."""
+    """Yield orders that begin with one object's way to a buffer; without any such, a plain one."""
     found = 0
     for k in rng.permutation(len(every)):
         order = every[k]
@@ -134,10 +134,10 @@ def _with_buffers(
 
 
 def _buffer(n: int, now: Sequence[Pose], goals: Sequence[Pose], outlines: OutlinesAt) -> Pose | None:
-    """A free place for an object, clear of all others where they are and where they will be, near its way."""
+    """Find a free place for an object near its way, clear of all others where they are and where they will be."""
     others = [part for k in range(len(now)) for pose in (now[k], goals[k]) if k != n for part in outlines(k, pose)]
     space = FreeSpace([*others, *outlines(n, goals[n])], 0.0)
-    radius = _radius(outlines(n, now[n]), now[n])
+    radius = np.linalg.norm(np.concatenate(outlines(n, now[n])) - now[n].position[:2], axis=1).max()
     along = np.arange(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, _BUFFER_CELLS * CELL_M)
     places = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     free = places[space.clearance_at(places) >= radius + CLEARANCE_M]
@@ -153,16 +153,13 @@ def _with_detours(order: Sequence[Stage], now: Sequence[Pose], outlines: Outline
     for stage in order:
         n = stage.number
         corners = _corners(n, places, stage.target, outlines)
-        stages += [
-            Stage(n, Pose(np.array([*corner, places[n].position[2]]), places[n].quaternion)) for corner in corners
-        ]
-        stages.append(stage)
+        stages += [*(Stage(n, _moved(places[n], corner)) for corner in corners), stage]
         places[n] = stage.target
     return tuple(stages)
 
 
 def _corners(n: int, places: Sequence[Pose], target: Pose, outlines: OutlinesAt) -> Float[np.ndarray, "C 2"]:
-    """Where an object must turn on its way around others; none where the straight way is clear."""
+    """Find where an object must turn on its way around others; nowhere if the straight way is clear."""
     others = [part for k in range(len(places)) if k != n for part in outlines(k, places[k])]
     begin, end = places[n].position[:2], target.position[:2]
     none = np.zeros((0, 2))
@@ -177,13 +174,9 @@ def _corners(n: int, places: Sequence[Pose], target: Pose, outlines: OutlinesAt)
 
 
 def _breadth(outlines: Outlines, begin: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
-    """Of an object across the way that it goes [m]."""
+    """Measure the breadth of an object across the way that it goes [m]."""
     way = (end - begin) / max(float(np.linalg.norm(end - begin)), 1e-9)
     return float(np.ptp(np.concatenate(outlines) @ np.array([-way[1], way[0]])))
-
-
-def _radius(outlines: Outlines, pose: Pose) -> float:
-    return float(np.linalg.norm(np.concatenate(outlines) - pose.position[:2], axis=1).max())
 
 
 def _moved(pose: Pose, place: Float[np.ndarray, "2"]) -> Pose:
@@ -251,10 +244,10 @@ def push_outcomes(
     centre: Float[np.ndarray, "3"],
     outlines: Sequence[Float[np.ndarray, "_ 2"]],
 ) -> PushOutcomes:
-    """The table of an object.
+    """Make the table of an object.
 
     Args:
-        predict: tells what pushes do; without it, the table is empty.
+        predict: predicts what pushes do; without it, the table is empty.
         state: of a scene with this object alone.
         centre: of mass, in the object's frame [m].
         outlines: of its convex parts seen from above [m].
@@ -277,14 +270,14 @@ def push_outcomes(
 
 
 def _between(values: Float[np.ndarray, "P T1 D"]) -> Float[np.ndarray, "P S D"]:
-    """Linear interpolation in time, without the first moment."""
+    """Interpolate linearly in time, without the first moment."""
     share = np.arange(1, _BETWEEN + 1)[:, None] / _BETWEEN
     parts = values[:, :-1, None] * (1 - share) + values[:, 1:, None] * share
     return parts.reshape(len(values), -1, values.shape[2])
 
 
 def silhouette(outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "V 2"]:
-    """The outer outline of a union of convex outlines, counterclockwise, within a millimetre [m].
+    """Trace the outer outline of a union of convex outlines, counterclockwise, within a millimetre [m].
 
     Gaps that the pusher does not fit into are closed, and what is still apart is joined by the convex hull.
     """
@@ -307,7 +300,7 @@ def silhouette(outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray
 
 
 def _candidates(outline: Float[np.ndarray, "V 2"]) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2"]]:
-    """Starts and directions of pushes from all around."""
+    """Choose starts and directions of pushes from all around."""
     points = _spaced(outline, _PLACES)
     tangent = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
     normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
@@ -323,15 +316,22 @@ def _candidates(outline: Float[np.ndarray, "V 2"]) -> tuple[Float[np.ndarray, "P
 
 
 def _spaced(outline: Float[np.ndarray, "V 2"], count: int) -> Float[np.ndarray, "count 2"]:
-    """Equally spaced points along a closed line."""
+    """Return equally spaced points along a closed line."""
+    return _along_closed(outline, lambda length: (np.arange(count) + 0.5) / count * length)
+
+
+def _along_closed(
+    outline: Float[np.ndarray, "V 2"], places: Callable[[float], Float[np.ndarray, "n"]]
+) -> Float[np.ndarray, "n 2"]:
+    """Return points of a closed line at distances from its first corner, which `places` gives for its length."""
     closed = np.vstack([outline, outline[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
-    at = (np.arange(count) + 0.5) / count * along[-1]
+    at = places(along[-1])
     return np.stack([np.interp(at, along, closed[:, axis]) for axis in range(2)], axis=1)
 
 
 def _loop(outline: Float[np.ndarray, "V 2"]) -> Float[np.ndarray, "L 2"]:
-    """The convex hull, widened by the pusher and its clearance."""
+    """Return the convex hull, widened by the pusher and its clearance."""
     angles = 2 * np.pi * np.arange(_ROUND) / _ROUND
     wide = (PUSHER_RADIUS_M + CLEARANCE_M + 2 * _SPARE_M) / np.cos(np.pi / _ROUND)
     rim = wide * np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -349,44 +349,32 @@ _APART_M = 0.005
 _MEETS_M = PUSHER_RADIUS_M + 0.01  # beside the pusher's line, what of an outline it may meet
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Pushes:
-    """P straight pushes of one object.
-
-    Attributes:
-        starts: of the pusher's centre, free of the object [m].
-        ends: likewise, where the object should have arrived [m].
-    """
-
-    starts: Float[np.ndarray, "P 2"]
-    ends: Float[np.ndarray, "P 2"]
-
-
 def outline_points(outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "n 2"]:
-    """Points at most 5 mm apart all along the outlines of an object's convex parts [m]."""
-    pushes = []
-    for outline in outlines:
-        closed = np.vstack([outline, outline[:1]])
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
-        at = np.linspace(0, length[-1], max(int(np.ceil(length[-1] / _APART_M)), 1), endpoint=False)
-        between = np.stack([np.interp(at, length, closed[:, axis]) for axis in range(2)], axis=1)
-        pushes += [outline, between]
-    return np.concatenate(pushes)
+    """Return points at most 5 mm apart all along the outlines of an object's convex parts [m]."""
+
+    def places(length: float) -> Float[np.ndarray, "n"]:
+        return np.linspace(0, length, max(int(np.ceil(length / _APART_M)), 1), endpoint=False)
+
+    return np.concatenate([points for own in outlines for points in (own, _along_closed(own, places))])
 
 
 def straight_pushes(
-    outline: Float[np.ndarray, "K 2"], offset: Float[np.ndarray, "2"], count: int, rng: np.random.Generator | None
-) -> Pushes:
-    """Pushes that bring an object about as far as it has to go.
+    outline: Float[np.ndarray, "K 2"], offset: Float[np.ndarray, "2"], count: int, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "count 2"], Float[np.ndarray, "count 2"]]:
+    """Draw straight pushes that bring an object about as far as it has to go.
 
     Args:
         outline: of the object from above, points all along it, see `outline_points` [m].
         offset: how far it has to go [m], not zero.
         count: how many to draw.
-        rng: draws directions, places beside the middle and lengths; None for pushes straight through the middle.
+        rng: draws directions, places beside the middle and lengths.
+
+    Returns:
+        Starts of the pusher's centre, free of the object, and its ends, where the object should have arrived [m].
     """
     direction_to, distance = np.arctan2(offset[1], offset[0]), np.linalg.norm(offset)
-    turn, aside_by, share = _sample_directions(count, rng)
+    turn = rng.normal(0, _ANGLE_RAD, count)
+    aside_by, share = rng.normal(0, _ASIDE, count).clip(-1, 1), rng.uniform(*_LENGTHS, count)
     angle = direction_to + turn
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     side = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
@@ -398,14 +386,7 @@ def straight_pushes(
     touching = back - PUSHER_RADIUS_M
     lateral = aside[:, None] * side
     starts = (touching - CLEARANCE_M - _SPARE_M)[:, None] * direction + lateral
-    return Pushes(starts, (touching + distance * share)[:, None] * direction + lateral)
-
-
-def _sample_directions(count: int, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    if rng is None:
-        return np.zeros(count), np.zeros(count), np.ones(count)
-    turn = rng.normal(0, _ANGLE_RAD, count)
-    return turn, rng.normal(0, _ASIDE, count).clip(-1, 1), rng.uniform(*_LENGTHS, count)
+    return starts, (touching + distance * share)[:, None] * direction + lateral
 
 
 # Recombination of rollouts: pushes that succeeded in some futures, done one after another in the best order.
@@ -456,12 +437,12 @@ class PushStage:
 def recombined(
     rollouts: Rollouts, costs: Float[np.ndarray, "K T1 N"], outlines: OutlinesAt, count: int
 ) -> Float[np.ndarray, "C T 3"]:
-    """Sequences made of stages of other sequences.
+    """Make sequences of stages of other sequences.
 
     Args:
         rollouts: futures of those, from one state.
         costs: of each object in them, before the first and after each action [m].
-        outlines: tells those of an object at a pose [m].
+        outlines: returns those of an object at a pose [m].
         count: of sequences at most; fewer or none come back where no stage brings anything nearer.
     """
     horizon = rollouts.positions.shape[1] - 1
@@ -473,7 +454,7 @@ def recombined(
 
 
 def push_stages(rollouts: Rollouts, costs: Float[np.ndarray, "K T1 N"]) -> dict[int, list[PushStage]]:
-    """The best stages of each object that any brings nearer, the best first.
+    """Find the best stages of each object that any brings nearer, the best first.
 
     Args:
         rollouts: futures from one state.
@@ -495,14 +476,14 @@ def push_stages(rollouts: Rollouts, costs: Float[np.ndarray, "K T1 N"]) -> dict[
 
 
 def _actions_alone(moves: Bool[np.ndarray, "t N"], n: int, fresh: Bool[np.ndarray, "N"]) -> int:
-    """Actions before the first that moves another object which nothing moved before, or another one instead of n."""
+    """Count actions before the first that moves an object which nothing moved before, or another one instead of n."""
     others = moves & (np.arange(moves.shape[1]) != n)
     ends = (others & (fresh | ~moves[:, n, None])).any(axis=1)
     return int(ends.argmax()) if ends.any() else len(moves)
 
 
 def _moves(rollouts: Rollouts) -> Bool[np.ndarray, "K T N"]:
-    """Which objects each action moves."""
+    """Find which objects each action moves."""
     shift = np.linalg.norm(np.diff(rollouts.positions, axis=1), axis=-1)
     turn = np.abs(np.diff(rollouts.quaternions, axis=1)).max(axis=-1)
     return (shift > _MOVED_M) | (turn > _MOVED_Q)
@@ -511,7 +492,7 @@ def _moves(rollouts: Rollouts) -> Bool[np.ndarray, "K T N"]:
 def _distinct(
     n: int, found: Sequence[tuple[float, int, int, int]], rollouts: Rollouts, total: Float[np.ndarray, "K T1"]
 ) -> list[PushStage]:
-    """The first few stages that begin at different places, of (worth, sequence, first action, end)."""
+    """Make the first few stages that begin at different places, of (worth, sequence, first action, end)."""
     kept: list[PushStage] = []
     for _, k, begin, end in found:
         path = rollouts.pusher[k, begin : end + 1]
@@ -529,7 +510,7 @@ def _distinct(
 def _best_chains(
     stages: Mapping[int, list[PushStage]], pusher: Float[np.ndarray, "2"], horizon: int, count: int
 ) -> list[list[PushStage]]:
-    """Stages of different objects in the orders that take most from the cost, as far as is known before a rollout."""
+    """Chain stages of different objects in the orders that take most from the cost, as predicted before a rollout."""
     ranked = sorted(stages, key=lambda n: -max(stage.gain for stage in stages[n]))[:_OBJECTS]
     scored: list[tuple[float, list[PushStage]]] = []
     for order in permutations(ranked, min(_STAGES, len(ranked))):
@@ -542,7 +523,7 @@ def _best_chains(
 def _scored_chains(
     choices: Sequence[list[PushStage]], pusher: Float[np.ndarray, "2"], horizon: int, count: int
 ) -> list[tuple[float, list[PushStage]]]:
-    """The best choices of one stage of each object in a given order, with what they take from the cost."""
+    """Find the best choices of one stage of each object in a given order, with what they take from the cost."""
     at, when, score = pusher[None], np.zeros(1), np.zeros(1)
     for own in choices:
         starts, ends = (np.array([getattr(stage, place) for stage in own]) for place in ("start", "end"))
@@ -682,7 +663,7 @@ class ObjectPushes:
         return DrawnPushes(len(kept), count, lambda k: self._corners(kept[k], first, later) @ turn.T + centre)
 
     def _first_pushes(self, rows: Int[np.ndarray, "M"], yaw: float, goal: Pose, later: ObjectPushes) -> _FirstPushes:
-        """What some pushes of the table do to an object that is turned by `yaw`, in the terms of later ones."""
+        """Compute what pushes of the table do to an object that is turned by `yaw`, in the frame of later ones."""
         around = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
         ends = quaternion_multiply(quaternion_multiply(around, self._turns[rows]), self._reference)
         then, _ = planar_turns(later._reference, ends)
@@ -694,7 +675,7 @@ class ObjectPushes:
     def _path_lengths(
         self, rows: Int[np.ndarray, "C 3"], first: _FirstPushes, later: ObjectPushes, pusher: Float[np.ndarray, "2"]
     ) -> Float[np.ndarray, "C"]:
-        """About how far the pusher goes, straight from push to push [m]."""
+        """Estimate how far the pusher goes, straight from push to push [m]."""
         own = first.rows[rows[:, 0]]
         path = self._walked(own, np.broadcast_to(pusher, (len(own), 2)))
         at = _into(first.motions[rows[:, 0]], self._ends[own])
@@ -710,7 +691,7 @@ class ObjectPushes:
         )
 
     def _corners(self, row: Int[np.ndarray, "3"], first: _FirstPushes, later: ObjectPushes) -> Float[np.ndarray, "C 2"]:
-        """The pusher's path through pushes, in the planar frame before the first."""
+        """Compute the pusher's path through pushes, in the planar frame before the first."""
         own, motion = first.rows[row[0]], first.motions[row[0]]
         then = later._path_through([int(push) for push in row[1:] if push >= 0])
         return self._followed_by(int(own), motion, then, later._outcomes.loop)
@@ -723,7 +704,7 @@ class ObjectPushes:
     def _followed_by(
         self, row: int, motion: Float[np.ndarray, "3"], then: Float[np.ndarray, "C 2"], loop: Float[np.ndarray, "L 2"]
     ) -> Float[np.ndarray, "D 2"]:
-        """The path of one push, then around the object, then along a path in the frame after it."""
+        """Continue the path of one push around the object, then along a path in the frame after it."""
         number = row // len(self._outcomes.lengths)
         path = np.stack([self._outcomes.starts[number], self._ends[row]])
         if not len(then):
@@ -784,14 +765,16 @@ class _FirstPushes:
 
     @property
     def lands(self) -> Bool[np.ndarray, "M"]:
-        """Whether the object lies on that side then."""
+        """True where the object lies on that side then."""
         return self.tilts <= UPRIGHT_RAD
 
 
 def _sequences(
     first: _FirstPushes, target: Float[np.ndarray, "3"], later: ObjectPushes, rng: np.random.Generator
 ) -> tuple[Int[np.ndarray, "C 3"], Float[np.ndarray, "C"]]:
-    """Sequences as numbers of first pushes, then rows of the table of later ones, -1 for none; what they leave [m].
+    """List sequences of up to three pushes, and the error that they leave [m].
+
+    A sequence is the number of its first push, then rows of the table of later ones, -1 for none.
 
     Args:
         first: pushes that are possible.
@@ -820,7 +803,7 @@ def _sequences(
 def around_loop(
     loop: Float[np.ndarray, "L 2"], begin: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Corners of the shorter way along a closed convex line, from near one place to near another [m]."""
+    """Return corners of the shorter way along a closed convex line, from near one place to near another [m]."""
     i, j = (int(np.linalg.norm(loop - place, axis=1).argmin()) for place in (begin, end))
     forth = np.arange(i, i + (j - i) % len(loop) + 1) % len(loop)
     back = np.arange(i, i - (i - j) % len(loop) - 1, -1) % len(loop)
@@ -833,7 +816,7 @@ def _rotation(angle: float) -> Float[np.ndarray, "2 2"]:
 
 
 def _into(motions: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
-    """Points in the frame of an object that has made motions."""
+    """Express points in the frame of an object that has made motions."""
     cos, sin = np.cos(motions[:, 2]), np.sin(motions[:, 2])
     x, y = (points - motions[:, :2]).T
     return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
@@ -842,7 +825,7 @@ def _into(motions: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "M 2"]) -
 def _after(
     goal: Float[np.ndarray, "3"] | Float[np.ndarray, "M 3"], motions: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "M 3"]:
-    """Goals (x, y, yaw) in the frame of an object that has made motions: m^-1 e."""
+    """Express goals (x, y, yaw) in the frame of an object that has made motions: m^-1 e."""
     goals = np.broadcast_to(goal, motions.shape)
     yaw = (goals[:, 2] - motions[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return np.concatenate([_into(motions, goals[:, :2]), yaw[:, None]], axis=1)
@@ -882,7 +865,7 @@ class PushProposals:
     def draw(
         self, state: SceneState, goal: PoseGoal, count: int, horizon: int, rng: np.random.Generator
     ) -> Float[np.ndarray, "P T 3"]:
-        """About `count` sequences; none where everything is where it should be or there is no room for the pusher.
+        """Propose about `count` sequences; none where everything is in its place or the pusher has no room.
 
         Args:
             state: of the scene, with its pusher.
@@ -918,7 +901,7 @@ class PushProposals:
         return recombined(rollouts, object_costs(rollouts, goal), self._outlines(rollouts.names), count)
 
     def _outlines(self, names: Sequence[str]) -> OutlinesAt:
-        """Tells the outlines of objects, each pose's once."""
+        """Return a function that computes the outlines of objects, each pose's once."""
         known: dict[tuple[int, bytes], Outlines] = {}
 
         def at(n: int, pose: Pose) -> Outlines:
@@ -961,7 +944,7 @@ class _PushSequences:
         self._known: dict[tuple[bytes, ...], _Leg] = {}
 
     def draw(self, order: tuple[Stage, ...], count: int) -> list[Float[np.ndarray, "T 3"]]:
-        """Sequences that go through stages in this order, as far as time and room allow."""
+        """Draw sequences that go through stages in this order, as far as time and room allow."""
         corners = [[self._pusher] for _ in range(count)]
         speeds: list[list[float]] = [[] for _ in range(count)]
         limit_s = self._horizon * STEP_S
@@ -983,7 +966,7 @@ class _PushSequences:
         return [actions_along(np.array(c), self._horizon, np.array(s)) for c, s in zip(corners, speeds, strict=True)]
 
     def _leg(self, stages: tuple[Stage, ...]) -> _Leg:
-        """What the last of some stages needs, when those before it have succeeded."""
+        """Prepare the last of some stages, when those before it have succeeded."""
         key = tuple(part for one in stages for part in (bytes([one.number]), one.target.position.tobytes()))
         if key not in self._known:
             places = list(self._now)
@@ -1003,15 +986,15 @@ class _PushSequences:
         return self._known[key]
 
     def _ways(self, leg: _Leg, stage: Stage, count: int) -> list[Float[np.ndarray, "C 2"]]:
-        """Pushes of a stage that begin where the pusher has room."""
+        """Draw pushes of a stage that begin where the pusher has room."""
         offset = (stage.target.position - leg.here.position)[:2]
         ways = leg.pool.sample(count - round(_STRAIGHT * count), self._rng)
         straight = 0 if ways and leg.rolls else count - len(ways)
         if straight and np.linalg.norm(offset) > _REACHED_M:
             sides = outline_points(self._outlines(stage.number, leg.here))
-            drawn = straight_pushes(sides, offset, _SPARE * straight, self._rng)
-            clear = np.flatnonzero(leg.space.is_free(drawn.starts))[:straight]
-            ways += list(np.stack([drawn.starts[clear], drawn.ends[clear]], axis=1))
+            starts, ends = straight_pushes(sides, offset, _SPARE * straight, self._rng)
+            clear = np.flatnonzero(leg.space.is_free(starts))[:straight]
+            ways += list(np.stack([starts[clear], ends[clear]], axis=1))
         return [way.clip(-PUSHER_REACH_M, PUSHER_REACH_M) for way in ways]
 
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from app.processes.plan_summary import PlanSketch
     from osfcore.control.estimators import SceneModels
     from osfcore.control.events import EpisodeSettings, Event
-    from osfcore.control.first_frame import PreparedLooks
     from osfcore.control.goal import GoalImage
+    from osfcore.control.prepared import PreparedLooks
     from osfcore.control.world import World
     from osfcore.planning.costs import PoseGoal
 
@@ -239,7 +239,7 @@ def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> Goa
 
 def _prepared(path: Path) -> PreparedLooks | None:
     """What was found out beforehand about an example, if the goal is an example's."""
-    from osfcore.control.first_frame import prepared_from_json
+    from osfcore.control.prepared import prepared_from_json
 
     return read_json(path, prepared_from_json) if path.is_file() else None
 

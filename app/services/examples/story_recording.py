@@ -23,8 +23,8 @@ from app.services.examples.stories import STORY_FILE
 from app.services.goals.goals import GOAL_SIDE
 from osfcore.control.estimators import load_scene_models
 from osfcore.control.events import GoalFound, Observed, Stepped
-from osfcore.control.first_frame import PreparedLook, PreparedLooks, prepared_to_json
 from osfcore.control.goal import GoalImage
+from osfcore.control.prepared import PreparedLook, PreparedLooks, prepared_to_json
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.states import EstimatedState, Observation
 from osfcore.io.files import as_mapping, read_json, write_atomically, write_json

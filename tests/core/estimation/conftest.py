@@ -2,8 +2,8 @@ import pytest
 
 from osfcore.estimation.objective import ObjectModels
 from osfcore.geometry.cameras import default_cameras
-from tests.core.estimation.scenes import BOTTLE, BOX, lying, observe, scene, shipped_models
-from tests.core.render.scenes import ball, block, wooden_table
+from tests.support.posed_scenes import BOTTLE, BOX, lying, observe, scene, shipped_models
+from tests.support.rendered_scenes import ball, block, wooden_table
 
 
 @pytest.fixture(scope="session")

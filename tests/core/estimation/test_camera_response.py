@@ -1,5 +1,3 @@
-"""Camera response: camera response, image model."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -7,14 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from osfcore.estimation.camera_response import ImageModel, linear_from_encoded, linear_of_srgb, srgb_of_linear
+from osfcore.estimation.camera_response import ImageModel, linear_of_srgb, srgb_of_linear
 from osfcore.estimation.photometry import adapted
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.render.types import SceneBatch
-from tests.core.estimation.scenes import BOTTLE, BOX, observe
 
-# Camera response
+USUAL = ImageModel(np.ones(3), 1.0, np.ones(3))
+OTHER = ImageModel(np.array([0.6, 0.7, 0.8]), 2.0, np.array([0.5, 0.8, 1.2]))
 
 
 def test_srgb_has_its_well_known_values():
@@ -30,25 +27,11 @@ def test_each_curve_is_the_inverse_of_the_other(value):
 
 
 @pytest.mark.parametrize("curve", [srgb_of_linear, linear_of_srgb])
-def test_the_curves_rise_without_a_step(curve):
+def test_the_curves_rise_without_a_step_and_keep_the_type(curve):
     steps = np.diff(curve(np.linspace(0, 1, 100_001)))
     assert np.all(steps > 0)
     assert steps.max() < 2e-4
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_types_of_numbers_are_kept(dtype):
-    values = np.linspace(0, 1, 7, dtype=dtype)
-    assert linear_from_encoded(values, "srgb").dtype == dtype
-    assert srgb_of_linear(values).dtype == dtype
-    np.testing.assert_array_equal(linear_from_encoded(values, "linear"), values)
-
-
-# Image model
-
-
-USUAL = ImageModel(np.ones(3), 1.0, np.ones(3))
-OTHER = ImageModel(np.array([0.6, 0.7, 0.8]), 2.0, np.array([0.5, 0.8, 1.2]))
+    assert curve(np.ones(2, np.float32)).dtype == np.float32
 
 
 def rendered(models, state):
@@ -56,24 +39,17 @@ def rendered(models, state):
 
 
 def test_the_usual_image_model_changes_nothing(models, truth, seen):
-    np.testing.assert_array_equal(rendered(adapted(models, (BOX, BOTTLE), USUAL), truth), rendered(models, truth))
+    np.testing.assert_array_equal(rendered(adapted(models, truth.names, USUAL), truth), rendered(models, truth))
     np.testing.assert_array_equal(USUAL.normalized(seen).images, seen.images.astype(np.float32))
+    assert USUAL.is_usual
+    assert USUAL.oddities == ""
+    assert not OTHER.is_usual
+    assert "exposure" in OTHER.oddities
 
 
 def test_encoded_pictures_are_decoded_and_brought_to_the_usual_exposure(seen):
     taken = replace(seen, images=srgb_of_linear(seen.images * (OTHER.gain / OTHER.scale)))
     np.testing.assert_allclose(replace(OTHER, encoding="srgb").normalized(taken).images, seen.images, atol=1e-5)
-
-
-def test_it_tells_what_is_unusual():
-    assert USUAL.told == ""
-    assert replace(USUAL, encoding="srgb").told == "sRGB values"
-    assert replace(USUAL, ambient=2.0).told == "ambient light 2.00 times the usual"
-    assert OTHER.told.startswith("exposure 0.60 0.70 0.80 times the usual, ambient")
-
-
-def test_a_white_surface_that_faces_the_lamp_keeps_its_radiance():
-    assert OTHER.scale * (AMBIENT * OTHER.ambient + DIFFUSE) == pytest.approx(1)
 
 
 def test_radiance_is_linear_in_the_ambient_light(models, truth):
@@ -86,12 +62,10 @@ def test_radiance_is_linear_in_the_ambient_light(models, truth):
 
 
 def test_the_tables_colour_does_not_change_objects(models, truth):
-    names = truth.names
-    other = ImageModel(np.ones(3), 1.0, OTHER.table)
-    shown = observe(models, truth, default_cameras(48)[:1])
-    ours, theirs = rendered(models, truth), rendered(adapted(models, names, other), truth)
-    inside = models.together.render(SceneBatch.of(truth), shown.cameras, outputs={"rgb", "opacity"}).opacity[0, 0]
-    solid, bare = inside.sum(axis=0) > 0.999, inside.sum(axis=0) == 0
+    ours = rendered(models, truth)
+    theirs = rendered(adapted(models, truth.names, replace(USUAL, table=OTHER.table)), truth)
+    opacity = models.together.render(SceneBatch.of(truth), default_cameras(48)[:1], outputs={"opacity"}).opacity[0, 0]
+    solid, bare = opacity.sum(axis=0) > 0.999, opacity.sum(axis=0) == 0
     np.testing.assert_allclose(theirs[solid], ours[solid], atol=2e-3)
     on_table = bare & (ours[..., 0] > 0.15)
     np.testing.assert_allclose(theirs[on_table], ours[on_table] * OTHER.table, rtol=1e-4)
