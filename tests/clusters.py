@@ -12,7 +12,7 @@ from distributed import LocalCluster
 from osfcore.experiments.harness import TaskResult
 from osfcore.fields.train_kiloosf import FieldStep, TrainField, train_field
 from osfcore.inspection.contact_sheet import Comparison
-from tests.core.fields.rendered_sets import QUICK
+from tests.support.rendered_sets import QUICK
 
 
 @contextmanager

@@ -21,7 +21,7 @@ def _render() -> None:
     from osfcore.geometry.light import SpotLamp  # what the library imports is checked by a hook that is set by then
     from osfcore.render.renderer import SceneRenderer
     from osfcore.render.types import OUTPUTS, SceneBatch
-    from tests.core.render.scenes import random_scene, view, wooden_table
+    from tests.support.rendered_scenes import random_scene, view, wooden_table
 
     fields, scene = random_scene(9)
     renderer = SceneRenderer(fields, wooden_table())

@@ -11,7 +11,7 @@ from osfcore.errors import InvalidInput
 
 
 def pick_device(name: str) -> torch.device:
-    """The device to compute on; "auto" takes a GPU where there is one.
+    """Return the device to compute on; "auto" takes a GPU where there is one.
 
     Raises:
         InvalidInput: if the name is unknown or there is no such device.

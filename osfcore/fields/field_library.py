@@ -17,18 +17,8 @@ TABLE_NAME = "table"
 FIELD_FILE = "field.safetensors"
 METRICS_FILE = "field.json"
 _SUFFIX = ".safetensors"
-_NUMBERS = (
-    "psnr_full",
-    "psnr_mask",
-    "psnr",
-    "test_images",
-    "train_images",
-    "bytes",
-    "minutes",
-    "iterations",
-    "seed",
-    "threads",
-)
+_QUALITY = ("psnr_full", "psnr_mask", "psnr", "test_images", "train_images")
+_NUMBERS = (*_QUALITY, "bytes", "minutes", "iterations", "seed", "threads")
 _WORDS = ("device", "data", "command", "machine")
 _LARGEST = 2**63
 _MOST_CHARACTERS = 1000
@@ -67,18 +57,18 @@ class FieldLibrary:
         self._shipped = shipped or Path(str(files("osfcore.fields") / "shipped"))
 
     def __eq__(self, other: object) -> bool:
-        """Whether both look into the same folders."""
+        """Return whether both look into the same folders."""
         return isinstance(other, FieldLibrary) and self._folders() == other._folders()
 
     def __hash__(self) -> int:
-        """By the folders."""
+        """Hash the folders."""
         return hash(self._folders())
 
     def _folders(self) -> tuple[Path | None, Path]:
         return self._trained, self._shipped
 
     def stamp(self, name: str) -> tuple[int, int] | None:
-        """Changes when a field is trained, trained again or deleted; None for those that ship with the program."""
+        """Return what changes when a field is trained, trained again or deleted; None for a shipped one."""
         if self._trained is None:
             return None
         try:
@@ -88,7 +78,7 @@ class FieldLibrary:
         return status.st_mtime_ns, status.st_size
 
     def folder(self, name: str) -> Path:
-        """Where a trained field of that name belongs.
+        """Return the folder where a trained field of that name belongs.
 
         Raises:
             UnknownName: if this library has no data directory.
@@ -98,7 +88,7 @@ class FieldLibrary:
         return self._trained / name
 
     def names(self) -> tuple[str, ...]:
-        """All objects with a field, in order of name."""
+        """Return all objects with a field, in order of name."""
         shipped = {path.stem for path in self._shipped.glob(f"*{_SUFFIX}")} - {TABLE_NAME}
         trained = set()
         if self._trained is not None and self._trained.is_dir():
@@ -106,11 +96,11 @@ class FieldLibrary:
         return tuple(sorted(name for name in shipped | trained if name.isprintable()))
 
     def has(self, name: str) -> bool:
-        """Whether an object has a field."""
+        """Return whether an object has a field."""
         return name in self.names()
 
     def info(self, name: str) -> FieldInfo:
-        """What is known of a field without loading it.
+        """Return what is known of a field without loading it.
 
         Raises:
             UnknownName: if there is none of that name.
@@ -123,11 +113,9 @@ class FieldLibrary:
             raise UnknownName("field", name, self.names()) from None
 
     def _info(self, name: str) -> FieldInfo:
-        trained = None if self._trained is None else self._trained / name / FIELD_FILE
-        if trained is not None and trained.is_file():
-            return FieldInfo(
-                name, "trained", trained, trained.stat().st_size, _metrics(trained.with_name(METRICS_FILE))
-            )
+        path = None if self._trained is None else self._trained / name / FIELD_FILE
+        if path is not None and path.is_file():
+            return FieldInfo(name, "trained", path, path.stat().st_size, _metrics(path.with_name(METRICS_FILE)))
         path = self._shipped / f"{name}{_SUFFIX}"
         return FieldInfo(name, "shipped", path, path.stat().st_size, _metrics(path.with_suffix(".json")))
 
@@ -162,7 +150,7 @@ def _metrics(path: Path) -> Mapping[str, Any]:
 
 
 def _is_metric(key: str, value: object) -> bool:
-    """Whether it is a figure or a word that we know, and that can be told further as it is."""
+    """Return whether it is a known figure or word that may be shown as it is."""
     if key in _NUMBERS and isinstance(value, int | float) and not isinstance(value, bool):
         return -_LARGEST <= value < _LARGEST  # not for NaN either
     if key in _WORDS and isinstance(value, str):

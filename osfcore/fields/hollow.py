@@ -1,22 +1,38 @@
-"""Which parts of a visual hull's surface are the object's, and which are lids over hollows that no silhouette shows.
+"""Objects with hollows that no silhouette shows, such as bowls: the visual hull is opened, and its voxels are fitted.
 
 A point of a surface has one colour and one normal, whoever looks at it: under all views and lights its brightness is
 that of Lambert's law, or the ambient part of it in shadow. A point of a lid shows each view another point of the inside
 behind it, for which no colour and normal can be found. So every voxel of the hull's surface gets the normal that
 explains best what is seen of it, and what no normal explains is opened (Kutulakos and Seitz's photo-consistency,
 with the light known). The hull holds the object: whatever it leaves in view or in the light truly is.
+
+What is left is fitted to the images by descent on the voxels alone, without networks.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numba
 import numpy as np
 from jaxtyping import Bool, Float32
 from scipy import ndimage
 
-from osfcore.fields.kiloosf import KiloOSF
-from osfcore.fields.rays import FIRST_AMBIENT, FIRST_NORMAL, ONE_AT_A_TIME, shell_field
+from osfcore.fields.kiloosf import EMPTY_G, FLOOR_G, KiloOSF
+from osfcore.fields.rays import (
+    FIRST_AMBIENT,
+    FIRST_NORMAL,
+    ONE_AT_A_TIME,
+    RayBatch,
+    RaySource,
+    clip_axis,
+    optical_density,
+    reshelled,
+    within,
+)
 from osfcore.io.image_set import ImageSet
+
+# ruff: noqa: ANN001, ANN202 - compiled functions; types are given by their callers
 
 MOST_MISFIT = 0.22  # of a surface: true ones have 0.1, the lids of bowl and mug 0.3 and 0.5 (medians)
 _NORMALS = 48  # that are tried
@@ -35,7 +51,7 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 def open_hollows(field: KiloOSF, images: ImageSet, *, fog_g: float) -> KiloOSF:
-    """The same field with nothing but a layer under the part of its surface on which views agree, and fog around that.
+    """Keep of a solid hull a layer under the part of its surface on which views agree, with fog around it.
 
     Args:
         field: a solid visual hull.
@@ -50,19 +66,16 @@ def open_hollows(field: KiloOSF, images: ImageSet, *, fog_g: float) -> KiloOSF:
     away = np.asarray(ndimage.distance_transform_edt(~_largest(seen & (smooth < MOST_MISFIT))))
     features = field.rows[field.index]
     features[..., 0] = np.where(away < _LAYER_VOXELS, features[..., 0], np.minimum(features[..., 0], fog_g))
-    keep = (field.index > 0) & (away <= _FOG_VOXELS)
-    return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)
+    return reshelled(field, (field.index > 0) & (away <= _FOG_VOXELS), features)
 
 
 def without_fog(field: KiloOSF) -> KiloOSF:
-    """The field without the corners that are neither opaque nor next to one that is: they can never become so again."""
-    keep = np.asarray(ndimage.binary_dilation(field.density > _OPAQUE_G), bool) & (field.index > 0)
-    features = field.rows[field.index]
-    return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)
+    """Leave out the corners that are neither opaque nor next to one that is: they can never become so again."""
+    return reshelled(field, np.asarray(ndimage.binary_dilation(field.density > _OPAQUE_G), bool) & (field.index > 0))
 
 
 def _largest(mask: Bool[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "nx ny nz"]:
-    """The largest piece, over small gaps: an object is in one, while the middle of a lid may look right and float."""
+    """Return the largest piece, over small gaps: an object is one piece, but the middle of a lid may float."""
     joined = np.asarray(ndimage.binary_dilation(mask, np.ones((3, 3, 3)), iterations=_GAP_VOXELS))
     pieces = np.zeros(mask.shape, np.int32)
     if not ndimage.label(joined, output=pieces):
@@ -73,9 +86,9 @@ def _largest(mask: Bool[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "nx ny nz"]
 def surface_misfit(
     field: KiloOSF, images: ImageSet, solid: Bool[np.ndarray, "nx ny nz"]
 ) -> Float32[np.ndarray, "nx ny nz"]:
-    """How badly the best Lambertian point explains what views see of each voxel of a surface.
+    """Measure how badly the best Lambertian point explains what views see of each voxel of a surface.
 
-    The robust mean over views of e^2 / (1 + e^2), with e the difference of brightness in tolerances: 0 where all
+    It is the robust mean over views of e^2 / (1 + e^2), with e the difference of brightness in tolerances: 0 where all
     agree, 1 where nothing does.
 
     Args:
@@ -88,8 +101,7 @@ def surface_misfit(
     """
     points = np.argwhere(solid & ~np.asarray(ndimage.binary_erosion(solid), bool))
     cameras = images.cameras
-    matrices = [c.intrinsics @ c.T_world_camera.inverse().matrix()[:3] for c in cameras]
-    to_pixels = np.array(matrices)
+    to_pixels = np.array([c.intrinsics @ c.T_world_camera.inverse().matrix()[:3] for c in cameras])
     to_pixels[..., 3] += to_pixels[..., :3] @ field.origin.astype(float)  # takes voxel coordinates
     to_pixels[..., :3] *= field.voxel
     eyes = (np.array([c.T_world_camera.position for c in cameras]) - field.origin) / field.voxel
@@ -105,7 +117,7 @@ def surface_misfit(
 
 
 def _directions(count: int) -> Float32[np.ndarray, "count 3"]:
-    """Unit vectors spread evenly: a Fibonacci lattice."""
+    """Spread unit vectors evenly: a Fibonacci lattice."""
     number = np.arange(count) + 0.5
     z, angle = 1 - 2 * number / count, np.pi * (1 + np.sqrt(5)) * number
     r = np.sqrt(1 - z * z)
@@ -113,8 +125,8 @@ def _directions(count: int) -> Float32[np.ndarray, "count 3"]:
 
 
 @numba.njit(fastmath=True, error_model="numpy")
-def _is_blocked(solid, x, y, z, dx, dy, dz):  # noqa: ANN001, ANN202
-    """Whether something solid stands in the way from a voxel into a direction."""
+def _is_blocked(solid, x, y, z, dx, dy, dz):
+    """Return whether something solid stands in the way from a voxel into a direction."""
     nx, ny, nz = solid.shape
     t = _CLEAR_VOXELS
     while True:
@@ -127,8 +139,8 @@ def _is_blocked(solid, x, y, z, dx, dy, dz):  # noqa: ANN001, ANN202
 
 
 @numba.njit(fastmath=True, error_model="numpy")
-def _brightness_at(image, opaque, to_pixels, point):  # noqa: ANN001, ANN202
-    """Bilinear brightness where an image shows a point; -1 outside of it and where the background mixes in."""
+def _brightness_at(image, opaque, to_pixels, point):
+    """Interpolate the brightness of a point in an image; -1 outside of it and where the background mixes in."""
     p = to_pixels[:, 0] * point[0] + to_pixels[:, 1] * point[1] + to_pixels[:, 2] * point[2] + to_pixels[:, 3]
     if p[2] <= 0:
         return -_ONE
@@ -144,10 +156,11 @@ def _brightness_at(image, opaque, to_pixels, point):  # noqa: ANN001, ANN202
 
 
 @numba.njit(fastmath=True, error_model="numpy")
-def _look(solid, opaque, point, to_pixels, eyes, lights, brightness, seen, towards, is_lit):  # noqa: ANN001, ANN202
-    """Collect what views see of a point: brightness, view's number, direction to the eye, and whether light gets there.
+def _look(solid, opaque, point, to_pixels, eyes, lights, brightness, seen, towards, is_lit):
+    """Collect what views see of a point: brightness, view's number, direction to the eye, and whether it is lit.
 
-    Returns how many see it.
+    Returns:
+        How many views see it.
     """
     count = 0
     x, y, z = point
@@ -168,8 +181,8 @@ def _look(solid, opaque, point, to_pixels, eyes, lights, brightness, seen, towar
 
 
 @numba.njit(fastmath=True, error_model="numpy")
-def _misfit(normal, lights, seen, towards, is_lit, shade):  # noqa: ANN001, ANN202
-    """Robust misfit of a sheet with this normal, its albedo fitted; `shade` is scratch."""
+def _misfit(normal, lights, seen, towards, is_lit, shade):
+    """Return the robust misfit of a sheet with this normal and the best albedo; `shade` is scratch memory."""
     count = len(shade)
     ratio = np.empty(count, np.float32)
     for k in range(count):
@@ -200,8 +213,8 @@ def _misfit(normal, lights, seen, towards, is_lit, shade):  # noqa: ANN001, ANN2
 
 
 @numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
-def _judge(misfit, solid, opaque, points, to_pixels, eyes, lights, brightness, normals):  # noqa: ANN001, ANN202
-    """The least misfit of every point over all normals; -1 where too few views look."""
+def _judge(misfit, solid, opaque, points, to_pixels, eyes, lights, brightness, normals):
+    """Fill in the least misfit of every point over all normals; -1 where too few views look."""
     views = len(eyes)
     for n in numba.prange(len(points)):
         seen, towards = np.empty((views, 2), np.float32), np.empty((views, 3), np.float32)
@@ -215,3 +228,184 @@ def _judge(misfit, solid, opaque, points, to_pixels, eyes, lights, brightness, n
         for a in range(len(normals)):
             least = min(least, _misfit(normals[a], lights, seen, towards, is_lit, shade))
         misfit[n] = least
+
+
+# Descent on the voxels of a field alone: without networks, which see the view, no lid can imitate a hollow.
+#
+# Each corner has a density, an albedo and its own dependence on the light, of second order in l, which learns
+# shadows:
+#
+#     radiance = albedo * (ambient + max(c . Y(l), 0))
+#     Y(l) = (1, l, l_x l_y, l_y l_z, l_x l_z, l_x^2 - l_y^2, 3 l_z^2 - 1)
+#
+# Errors count relative to brightness, since the inside of a hollow is mostly in shadow. Compiled for the CPU.
+
+
+_FEATURES = 13  # g, albedo (3), c (9)
+_FIRST_GAIN = 0.2
+_RATES = np.array([0.06] + [0.03] * 7 + [0.01] * 5, np.float32)  # of Adam, for each feature
+_COLOUR_STEPS = 60  # at first, in which density waits
+_MOST_G = 10.0
+_DARK = np.float32(0.05)  # brightness below which errors count as they are
+_ALPHA_WEIGHT = np.float32(0.5)
+_MOST_SAMPLES = 256
+_MOST_DEPTH = np.float32(6)  # optical depth at which a ray ends
+_PARTS = 4  # of a batch, each with its own sum: the same result on any number of threads
+_FLOOR_G = np.float32(FLOOR_G)
+
+
+def fit_voxels(field: KiloOSF, images: ImageSet, *, steps: int, rays: int, rng: np.random.Generator) -> KiloOSF:
+    """Fit density, albedo and dipole of a field's voxels by some steps of descent.
+
+    Args:
+        field: where to begin; its albedo and its networks are ignored.
+        images: what to learn from.
+        steps: of Adam.
+        rays: for each.
+        rng: chooses pixels and the offsets of samples.
+    """
+    source = RaySource(images)
+    pixels = source.silhouette_pixels()
+    values = np.zeros((len(field.rows), _FEATURES), np.float32)
+    values[:, 0], values[:, 1:4], values[:, 4] = field.rows[:, 0], 0.3, _FIRST_GAIN
+    values[:, 5:8] = field.rows[:, 4:7] * (0.3 / FIRST_NORMAL)
+    mean, square = np.zeros_like(values), np.zeros_like(values)
+    for step in range(1, steps + 1):
+        _keep_within(values)
+        batch = source.batch(rng.choice(pixels, rays))
+        gradient = _gradient(values, field, batch, rng.random(rays, dtype=np.float32))
+        mean += 0.1 * (gradient - mean)
+        square += 0.01 * (gradient * gradient - square)
+        change = _RATES * (mean / (1 - 0.9**step)) / (np.sqrt(square / (1 - 0.99**step)) + 1e-12)
+        values -= change if step > _COLOUR_STEPS else np.where(np.arange(_FEATURES) == 0, 0, change)
+    _keep_within(values)
+    rows = field.rows.copy()
+    rows[1:, :4], rows[1:, 4:7] = values[1:, :4], values[1:, 5:8]
+    return replace(field, rows=rows)
+
+
+def _keep_within(values: Float32[np.ndarray, "M 13"]) -> None:
+    """Clip to what features may be; row 0 is empty space."""
+    np.clip(values[:, 0], -_MOST_G, _MOST_G, out=values[:, 0])
+    np.clip(values[:, 1:4], 0, 1, out=values[:, 1:4])
+    values[0] = 0
+    values[0, 0] = EMPTY_G
+
+
+def _gradient(
+    values: Float32[np.ndarray, "M 13"], field: KiloOSF, rays: RayBatch, offsets: Float32[np.ndarray, "R"]
+) -> Float32[np.ndarray, "M 13"]:
+    """Return the gradient of the loss, which is the mean over rays."""
+    parts = np.zeros((_PARTS, *values.shape), np.float32)
+    origins = (rays.origins - field.origin) / np.float32(field.voxel)
+    arrays = (origins, rays.directions, rays.lights, rays.rgb, rays.alpha, offsets)
+    with ONE_AT_A_TIME:
+        _descend(parts, values, field.index, *(np.ascontiguousarray(a, np.float32) for a in arrays))
+    return parts.sum(axis=0) / np.float32(len(offsets))
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _harmonics(light, out):
+    """Fill in Y(l)."""
+    x, y, z = light
+    out[0], out[1], out[2], out[3], out[4], out[5], out[6] = _ONE, x, y, z, x * y, y * z, x * z
+    out[7], out[8] = x * x - y * y, 3 * z * z - _ONE
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _corners(index, p, rows, weights):
+    """Fill in rows and weights of the eight corners around a point in voxel coordinates."""
+    i, j, k = int(p[0]), int(p[1]), int(p[2])
+    fx, fy, fz = p[0] - np.float32(i), p[1] - np.float32(j), p[2] - np.float32(k)
+    for q in range(8):
+        a, b, c = q >> 2, (q >> 1) & 1, q & 1
+        rows[q] = index[i + a, j + b, k + c]
+        weights[q] = (fx if a else _ONE - fx) * (fy if b else _ONE - fy) * (fz if c else _ONE - fz)
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _walk(values, index, origin, direction, offset, rows, weights, features):
+    """Fill in the features along a ray, one sample a voxel, where there is density; return the number of samples."""
+    start, end = _ZERO, np.float32(1e9)
+    for axis in range(3):
+        start, end = clip_axis(
+            origin[axis], direction[axis], _ZERO, np.float32(index.shape[axis]) - np.float32(1.001), start, end
+        )
+    count, depth, t = 0, _ZERO, start + offset
+    p = np.empty(3, np.float32)
+    while t < end and count < _MOST_SAMPLES and depth < _MOST_DEPTH:
+        for axis in range(3):
+            p[axis] = within(origin[axis] + t * direction[axis], index.shape[axis])
+        t += _ONE
+        _corners(index, p, rows[count], weights[count])
+        g = _ZERO
+        for q in range(8):
+            g += weights[count, q] * values[rows[count, q], 0]
+        if g <= _FLOOR_G:
+            continue
+        for c in range(_FEATURES):
+            total = _ZERO
+            for q in range(8):
+                total += weights[count, q] * values[rows[count, q], c]
+            features[count, c] = total
+        depth += optical_density(g)
+        count += 1
+    return count
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _shade(features, count, light, gains, colour):
+    """Composite the samples of a ray: fill in their gains and the ray's colour, and return its optical depth."""
+    colour[:] = 0
+    depth = _ZERO
+    for s in range(count):
+        gain = _ZERO
+        for c in range(9):
+            gain += features[s, 4 + c] * light[c]
+        gains[s] = gain
+        own = optical_density(features[s, 0])
+        weight = np.exp(-depth) * (_ONE - np.exp(-own)) * (_AMBIENT + max(gain, _ZERO))
+        for c in range(3):
+            colour[c] += weight * features[s, 1 + c]
+        depth += own
+    return depth
+
+
+@numba.njit(fastmath=True, error_model="numpy")
+def _spread(rows, weights, features, gains, count, depth, light, slope, slope_alpha, out):
+    """Add a ray's part to the gradient: back to front, with the light from behind summed up on the way."""
+    behind, through = _ZERO, np.exp(-depth)
+    own = np.empty(_FEATURES, np.float32)
+    for s in range(count - 1, -1, -1):
+        g = features[s, 0]
+        after = np.exp(-depth)
+        depth -= optical_density(g)
+        weight = np.exp(-depth) - after
+        shade = _AMBIENT + max(gains[s], _ZERO)
+        toward = slope[0] * features[s, 1] + slope[1] * features[s, 2] + slope[2] * features[s, 3]
+        own[0] = (after * toward * shade - behind + slope_alpha * through) / (_ONE + np.exp(-g))
+        behind += weight * toward * shade
+        for c in range(3):
+            own[1 + c] = weight * slope[c] * shade
+        for c in range(9):
+            own[4 + c] = weight * toward * light[c] if gains[s] > 0 else _ZERO
+        for q in range(8):
+            for c in range(_FEATURES):
+                out[rows[s, q], c] += weights[s, q] * own[c]
+
+
+@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
+def _descend(parts, values, index, origins, directions, lights, rgb, alpha, offsets):
+    for part in numba.prange(len(parts)):
+        rows, weights = np.empty((_MOST_SAMPLES, 8), np.int32), np.empty((_MOST_SAMPLES, 8), np.float32)
+        features, gains = np.empty((_MOST_SAMPLES, _FEATURES), np.float32), np.empty(_MOST_SAMPLES, np.float32)
+        light, colour, slope = np.empty(9, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+        for r in range(part, len(origins), len(parts)):
+            count = _walk(values, index, origins[r], directions[r], offsets[r], rows, weights, features)
+            _harmonics(lights[r], light)
+            depth = _shade(features, count, light, gains, colour)
+            level = (colour[0] + colour[1] + colour[2]) / np.float32(3) + _DARK
+            for c in range(3):
+                slope[c] = 2 * (colour[c] - rgb[r, c]) / (level * level)
+            miss = 2 * _ALPHA_WEIGHT * (_ONE - np.exp(-depth) - alpha[r])
+            _spread(rows, weights, features, gains, count, depth, light, slope, miss, parts[part])

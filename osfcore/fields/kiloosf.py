@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 from scipy import ndimage
@@ -32,16 +32,17 @@ from osfcore.io.files import write_atomically
 FEATURES = 8  # g, albedo (3), n (3), latent
 NETWORK_INPUTS = 11  # n . l, latent, l (3), v (3), position in the cell (3)
 EMPTY_G = -10.0  # of row 0, which every corner outside the shell shares
+EMPTY_ROW = np.array([[EMPTY_G] + [0.0] * (FEATURES - 1)], np.float32)
 FLOOR_G = -6.0  # at and below it the density is exactly 0
 DENSITY_FLOOR = float(np.log1p(np.exp(FLOOR_G)))
 STEP_VOXELS = 0.5  # distance between samples along a ray, in training and in exact rendering
 MOST_HIDDEN = 64  # width of the tiny networks
 MACRO_BITS = 2
-MACRO = 1 << MACRO_BITS  # side of the blocks that tell occupied from empty space [voxels]
+MACRO = 1 << MACRO_BITS  # side of the blocks that divide occupied from empty space [voxels]
 
 
 def network_size(hidden: int) -> int:
-    """Number of parameters of one tiny network: two hidden layers, three outputs."""
+    """Return the number of parameters of one tiny network: two hidden layers, three outputs."""
     return (NETWORK_INPUTS + 1) * hidden + (hidden + 1) * hidden + (hidden + 1) * 3
 
 
@@ -94,8 +95,15 @@ class KiloOSF:
         return (self.origin + self.voxel * np.stack([solid.min(axis=0), solid.max(axis=0)])).astype(np.float32)
 
 
+def numbered(shell: Bool[np.ndarray, "nx ny nz"]) -> Int32[np.ndarray, "nx ny nz"]:
+    """Number the corners of a shell in the order of the grid, from 1; the others get 0, the row of empty space."""
+    index = np.zeros(shell.shape, np.int32)
+    index[shell] = 1 + np.arange(shell.sum(), dtype=np.int32)
+    return index
+
+
 def without_light(field: KiloOSF) -> KiloOSF:
-    """The same field with n = 0 and networks blind to n . l and l: its radiance is then the same under every light."""
+    """Set n = 0 and make the networks blind to n . l and l: the radiance is then the same under every light."""
     rows, networks = field.rows.copy(), field.networks.copy()
     rows[:, 4:7] = 0
     first = networks[:, : NETWORK_INPUTS * field.hidden].reshape(len(networks), NETWORK_INPUTS, field.hidden)
@@ -104,7 +112,7 @@ def without_light(field: KiloOSF) -> KiloOSF:
 
 
 def block_distances(density: Float32[np.ndarray, "nx ny nz"]) -> UInt8[np.ndarray, "bx by bz"]:
-    """How far blocks of voxels are from the nearest one that holds density: in blocks, along the worst axis.
+    """Return how far each block of voxels is from the nearest one that holds density: in blocks, along the worst axis.
 
     0 for those with density, 255 where there is none at all. A block counts the corners on all its faces. A ray in a
     block at distance d may leave all blocks less than d away at once.
@@ -147,7 +155,7 @@ def write_field(path: Path, field: KiloOSF) -> None:
 
 
 def field_bytes(field: KiloOSF) -> bytes:
-    """A field as the contents of a file. Features lose precision: 8 bits of each one's range."""
+    """Return a field as the contents of a file. Features lose precision: 8 bits of each one's range."""
     features = field.rows[1:]
     low = features.min(axis=0, initial=0).astype(np.float32)
     span = np.maximum(features.max(axis=0, initial=0) - low, 1e-6).astype(np.float32)
@@ -179,7 +187,7 @@ def read_field(path: Path) -> KiloOSF:
 
 
 def field_from_bytes(data: bytes, where: Path | str) -> KiloOSF:
-    """A field from the contents of a file.
+    """Make a field from the contents of a file.
 
     Args:
         data: as `field_bytes` makes them.
@@ -214,12 +222,8 @@ def _field(hidden: int, tensors: Mapping[str, np.ndarray]) -> KiloOSF:
     for axis in range(3):
         if np.moveaxis(shell, axis, 0)[[0, -1]].any():
             raise ValueError("the shell touches the grid's faces")
-    index = np.zeros(shape, np.int32)
-    index[shell] = 1 + np.arange(len(levels), dtype=np.int32)
-    empty = np.zeros((1, FEATURES), np.float32)
-    empty[0, 0] = EMPTY_G
     vectors = {name: _vector(tensors, name, size) for name, size in _VECTORS.items()}
-    rows = np.concatenate([empty, levels.astype(np.float32) / _LEVELS * vectors["span"] + vectors["low"]])
+    rows = np.concatenate([EMPTY_ROW, levels.astype(np.float32) / _LEVELS * vectors["span"] + vectors["low"]])
     cells, networks = tensors["cells"].astype(np.int32), tensors["networks"].astype(np.float32)
     if not 1 <= hidden <= MOST_HIDDEN or networks.shape != (len(networks), network_size(hidden)):
         raise ValueError(f"networks {networks.shape} of width {hidden}, at most {MOST_HIDDEN}")
@@ -228,10 +232,11 @@ def _field(hidden: int, tensors: Mapping[str, np.ndarray]) -> KiloOSF:
     voxel = float(tensors["voxel"][0])
     if not 1 / _LARGEST < voxel < _LARGEST:
         raise ValueError(f"a voxel of {voxel:g}")
-    origin, ambient = vectors["origin"], vectors["ambient"]
+    ambient = vectors["ambient"]
     if ambient.min() < 0 or vectors["span"].min() < 0:
         raise ValueError("ambient or span is negative")
-    return KiloOSF(origin, voxel, index, rows.astype(np.float32), cells, networks, hidden, ambient)
+    rows = rows.astype(np.float32)
+    return KiloOSF(vectors["origin"], voxel, numbered(shell), rows, cells, networks, hidden, ambient)
 
 
 def _vector(tensors: Mapping[str, np.ndarray], name: str, size: int) -> Float32[np.ndarray, "size"]:
@@ -242,7 +247,7 @@ def _vector(tensors: Mapping[str, np.ndarray], name: str, size: int) -> Float32[
 
 
 def read_tensors(path: Path, expected: str) -> Tensors:
-    """Metadata and tensors of a safetensors file of the expected format.
+    """Read metadata and tensors of a safetensors file of the expected format.
 
     Raises:
         CorruptFile: if the file is missing, cut short or of another format or version.
@@ -251,7 +256,7 @@ def read_tensors(path: Path, expected: str) -> Tensors:
 
 
 def tensors_from_bytes(data: bytes, expected: str, where: Path | str) -> Tensors:
-    """Metadata and tensors from the contents of a safetensors file.
+    """Return metadata and tensors from the contents of a safetensors file.
 
     Args:
         data: the contents.
@@ -269,7 +274,7 @@ def tensors_from_bytes(data: bytes, expected: str, where: Path | str) -> Tensors
 
 
 def tensor_format(path: Path) -> str | None:
-    """What kind of weights a safetensors file says it holds.
+    """Return the format that a safetensors file names: the kind of its weights.
 
     Raises:
         CorruptFile: if the file is missing or cut short.

@@ -68,8 +68,13 @@ class KiloQuery(nn.Module):
         corners = [(i * ny + j) * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
         self.register_buffer("corners", torch.tensor(corners, device=device))
 
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return self.rows.device
+
     def to_field(self, grid: KiloOSF) -> KiloOSF:
-        """The present numbers as a field on the grid and cells of `grid`."""
+        """Return the present numbers as a field on the grid and cells of `grid`."""
 
         def array(tensor: Tensor) -> np.ndarray:
             return tensor.detach().to("cpu", torch.float32).numpy().copy()
@@ -78,7 +83,7 @@ class KiloQuery(nn.Module):
         return KiloOSF(grid.origin, grid.voxel, grid.index, rows, grid.cells, networks, grid.hidden, ambient)
 
     def features(self, x: Float[Tensor, "S 3"]) -> Float[Tensor, "S 8"]:
-        """Features interpolated at points of the grid's box [m]; points outside are moved to its faces."""
+        """Interpolate features at points of the grid's box [m]; points outside are moved to its faces."""
         most = torch.tensor(self.shape, dtype=x.dtype, device=x.device) - 1.001
         p = torch.minimum(((x - self.low) / self.voxel).clamp(min=0), most)
         whole = p.floor()
@@ -91,11 +96,11 @@ class KiloQuery(nn.Module):
         return functional.embedding_bag(rows, self.rows, per_sample_weights=weights, mode="sum") * self.row_units
 
     def sigma(self, g: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-        """Density [1/m] of the density feature."""
+        """Return the density [1/m] of the density feature."""
         return torch.relu(functional.softplus(g) - DENSITY_FLOOR) / self.voxel
 
     def density(self, x: Float[Tensor, "S 3"]) -> Float[Tensor, "S"]:
-        """Density at points of the field's frame [1/m]; 0 outside the grid's box."""
+        """Return the density at points of the field's frame [1/m]; 0 outside the grid's box."""
         p = (x - self.low) / self.voxel
         most = torch.tensor(self.shape, dtype=x.dtype, device=x.device) - 1
         inside = ((p >= 0) & (p <= most)).all(dim=-1)
@@ -137,7 +142,7 @@ class KiloQuery(nn.Module):
         return Scatter(albedo * self.ambient, albedo * gain, self.sigma(features[:, 0]))
 
     def _run_networks(self, inputs: Float[Tensor, "S 11"], number: Int[Tensor, "S"]) -> Float[Tensor, "S 3"]:
-        """Each input through its own tiny network: sorted, padded to equal counts, and multiplied as a batch."""
+        """Pass each input through its own tiny network: sorted, padded to equal counts, multiplied as a batch."""
         order = torch.argsort(number)
         asked, counts = torch.unique_consecutive(number[order], return_counts=True)
         if not len(asked):

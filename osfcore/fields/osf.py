@@ -7,13 +7,13 @@ half its width, which also reads the light and the view, gives the light that is
     sigma = DENSITY_GAIN * softplus(s) / half of the box's longest side         [1 / unit of length]
     rho   = albedo * (ambient + softplus(gain))
 
-It is a teacher (`training.distillation`) and a yardstick; what is shipped is a KiloOSF. Deviations from the paper: rho
-keeps an ambient part that neither light nor view changes, because our lamp comes with ambient light that no shadow
+It is a teacher (`train_kiloosf.Distillation`) and a yardstick; what is shipped is a KiloOSF. Deviations from the paper:
+rho keeps an ambient part that neither light nor view changes, because our lamp comes with ambient light that no shadow
 removes and because every image shows one light only, from which a free split could not be learned; the sigmoid of the
 published code is on the albedo alone, so that a well-lit point may send out more than it; eq. 2's integral over light
 directions is one term, since the light is distant; lights and views have unit length, in training as in use (the
-published code mixes unit lights and such of length 15); positions are divided by the object's box, not by a constant
-of each scene; and samples are proposed by a voxel grid (`training.osf_training`) in place of NeRF's coarse network.
+published code mixes unit lights and such of length 15); positions are divided by the object's box, not by a constant of
+each scene; and samples are proposed by a voxel grid (`train_osf.NetworkStage`) in place of NeRF's coarse network.
 """
 
 from __future__ import annotations
@@ -62,28 +62,10 @@ class OSFSize:
 
 
 def encoding(values: Float[Tensor, "S d"], octaves: int) -> Float[Tensor, "S e"]:
-    """The values, then sine and cosine of 1, 2, 4, ... times them: d * (1 + 2 * octaves) columns."""
+    """Return the values, then sine and cosine of 1, 2, 4, ... times them: d * (1 + 2 * octaves) columns."""
     scales = 2.0 ** torch.arange(octaves, dtype=values.dtype, device=values.device)
     angles = (values[:, None, :] * scales[:, None]).flatten(1)
     return torch.cat([values, torch.sin(angles), torch.cos(angles)], dim=-1)
-
-
-def outgoing_radiance(
-    scatter: Scatter,
-    light_intensity: float | Float[Tensor, "S 3"],
-    ambient_intensity: float | Float[Tensor, "S 3"] = 1.0,
-) -> Float[Tensor, "S 3"]:
-    """L_out at S points, eq. 2 for one distant light.
-
-    The integral over light directions is the one term rho * L_light, linear in the light's intensity. Deviation:
-    ambient light has an intensity of its own, so that a lamp can be dimmed or shadowed without it.
-
-    Args:
-        scatter: both parts of rho.
-        light_intensity: L_light at the points, relative to the lamp of the training images.
-        ambient_intensity: likewise, relative to their ambient light.
-    """
-    return ambient_intensity * scatter.ambient + light_intensity * scatter.direct
 
 
 class OSF(nn.Module):
@@ -116,6 +98,7 @@ class OSF(nn.Module):
         self.register_buffer("centre", torch.as_tensor((low + high) / 2, dtype=dtype, device=device))
         width, encoded = self.size.width, 3 * (1 + 2 * POSITION_OCTAVES)
         inputs = [encoded] + [width] * (self.size.depth - 1)
+        self._skip = self.size.depth // 2  # the trunk's layer that reads the position once more
         inputs[self._skip] += encoded
         directions = 2 * 3 * (1 + 2 * DIRECTION_OCTAVES)
 
@@ -141,17 +124,12 @@ class OSF(nn.Module):
         """Where it computes."""
         return self.ambient.device
 
-    @property
-    def _skip(self) -> int:
-        """The trunk's layer that reads the position once more."""
-        return self.size.depth // 2
-
     def density(self, x: Float[Tensor, "S 3"]) -> Float[Tensor, "S"]:
-        """Density at points of the object's frame [1/m]."""
+        """Return the density at points of the object's frame [1/m]."""
         return self._sigma(self.material(self._features(x))[:, 0])
 
     def material_at(self, x: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
-        """Density [1/m] and albedo at points: what depends on neither light nor view."""
+        """Return density [1/m] and albedo at points, which depend on neither light nor view."""
         material = self.material(self._features(x))
         return self._sigma(material[:, 0]), torch.sigmoid(material[:, 1:])
 

@@ -1,9 +1,9 @@
-"""Rays through a field: sampling those of an image set, marching along them, and the voxel shell that they skip to."""
+"""Rays through a field: those of an image set, marching along them, and the voxel shell that they need."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -16,6 +16,7 @@ from scipy import ndimage
 from osfcore.fields.kiloosf import (
     DENSITY_FLOOR,
     EMPTY_G,
+    EMPTY_ROW,
     FEATURES,
     FLOOR_G,
     MACRO,
@@ -23,6 +24,7 @@ from osfcore.fields.kiloosf import (
     NETWORK_INPUTS,
     KiloOSF,
     network_size,
+    numbered,
 )
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_set import ImageSet
@@ -44,7 +46,7 @@ _EDGE = np.float32(1.001)  # before the last corner, so that there is always a n
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def optical_density(g):  # noqa: ANN001, ANN201
-    """Sigma * voxel of a density feature g."""
+    """Return sigma * voxel of a density feature g."""
     if g <= _FLOOR_G:
         return np.float32(0)
     if g > np.float32(15):
@@ -54,7 +56,7 @@ def optical_density(g):  # noqa: ANN001, ANN201
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def interpolate(flat, start, ny, nz, px, py, pz):  # noqa: ANN001, ANN201, D417
-    """Trilinear value at a point of a grid.
+    """Interpolate between the eight corners around a point of a grid.
 
     Args:
         flat: values on the corners of one or several grids.
@@ -78,13 +80,13 @@ def interpolate(flat, start, ny, nz, px, py, pz):  # noqa: ANN001, ANN201, D417
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def within(p, count):  # noqa: ANN001, ANN201
-    """A voxel coordinate moved between the first and the last of `count` corners."""
+    """Move a voxel coordinate between the first and the last of `count` corners."""
     return min(max(p, np.float32(0)), np.float32(count) - _EDGE)
 
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201, D417
-    """The part of a ray that lies between two bounds on one axis; it ends before it begins where there is none.
+    """Return the part of a ray between two bounds on one axis; where there is none, it ends before it begins.
 
     Args:
         origin, direction: of the ray on this axis.
@@ -99,7 +101,7 @@ def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201, D4
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def leave_blocks(p, d, inverse, block, distance):  # noqa: ANN001, ANN201
-    """How far along a ray it stays, on one axis, among the blocks known to be empty.
+    """Return how far a ray stays, on one axis, among the blocks known to be empty.
 
     Args:
         p: where the ray is [voxels].
@@ -115,7 +117,7 @@ def leave_blocks(p, d, inverse, block, distance):  # noqa: ANN001, ANN201
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def inverted(d):  # noqa: ANN001, ANN201
-    """1 / d; very large for (almost) 0."""
+    """Return 1 / d; a very large number where d is almost 0."""
     if abs(d) > np.float32(1e-9):
         return _ONE / d
     return np.float32(1e9)
@@ -129,11 +131,8 @@ def _march(origins, directions, density, macro, low, voxel, step, offsets, min_w
     most = ts.shape[1]
     for r in numba.prange(len(origins)):
         # In voxel coordinates the box is [0, n - 1].
-        ox, oy, oz = (
-            (origins[r, 0] - low[0]) / voxel,
-            (origins[r, 1] - low[1]) / voxel,
-            (origins[r, 2] - low[2]) / voxel,
-        )
+        ox, oy = (origins[r, 0] - low[0]) / voxel, (origins[r, 1] - low[1]) / voxel
+        oz = (origins[r, 2] - low[2]) / voxel
         dx, dy, dz = directions[r, 0] / voxel, directions[r, 1] / voxel, directions[r, 2] / voxel
         ix, iy, iz = inverted(dx), inverted(dy), inverted(dz)
         t0, t1 = clip_axis(ox, dx, np.float32(0), np.float32(nx) - _EDGE, np.float32(0), np.float32(1e9))
@@ -176,10 +175,10 @@ def march(
     min_transmittance: float = 1e-3,
     most: int = 24,
 ) -> tuple[Float32[np.ndarray, "R most"], Bool[np.ndarray, "R most"]]:
-    """Where rays meet a field: distances of the samples that matter, front to back, and which of the slots are used.
+    """Find the samples of rays that matter: their distances from front to back [m], and which of the slots are used.
 
     Args:
-        field: what is looked at.
+        field: what the rays meet.
         origins: of the rays in the field's frame [m].
         directions: unit vectors.
         step: between samples [m].
@@ -194,15 +193,10 @@ def march(
     offsets = np.full(count, 0.5, np.float32) if offsets is None else offsets
     # Other memory layouts and types would be compiled anew, which takes half a minute.
     origins, directions, offsets = (np.array(a, np.float32, order="C") for a in (origins, directions, offsets))
-    numbers = (
-        np.float32(field.voxel),
-        np.float32(step),
-        offsets,
-        np.float32(min_weight),
-        np.float32(min_transmittance),
-    )
+    voxel, step, least, passing = (np.float32(n) for n in (field.voxel, step, min_weight, min_transmittance))
+    grid = field.density, field.macro, field.origin, voxel
     with ONE_AT_A_TIME:
-        _march(origins, directions, field.density, field.macro, field.origin, *numbers, ts, counts)
+        _march(origins, directions, *grid, step, offsets, least, passing, ts, counts)
     return ts, np.arange(most) < counts[:, None]
 
 
@@ -230,6 +224,10 @@ class RayBatch:
     rgb: Float32[np.ndarray, "R 3"]
     alpha: Float32[np.ndarray, "R"]
 
+    def at(self, ts: Float32[np.ndarray, "R S"]) -> Float32[np.ndarray, "R S 3"]:
+        """Return the points at S distances along each ray [m]."""
+        return self.origins[:, None] + ts[..., None] * self.directions[:, None]
+
 
 class RaySource:
     """The rays of a set's pixels. A pixel's number counts through images, rows and columns."""
@@ -243,7 +241,7 @@ class RaySource:
         self.image_shape = images.rgba.shape[1:3]
 
     def silhouette_pixels(self) -> Int64[np.ndarray, "n"]:
-        """Numbers of the pixels in and close around the silhouettes; the others show that there is nothing."""
+        """Return the numbers of the pixels in and close around the silhouettes."""
         kernel = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
         parts = []
         for number, rgba in enumerate(self._images.rgba):
@@ -252,12 +250,12 @@ class RaySource:
         return np.concatenate(parts)
 
     def image_pixels(self, number: int) -> Int64[np.ndarray, "n"]:
-        """Numbers of all pixels of one image."""
+        """Return the numbers of all pixels of one image."""
         size = self.image_shape[0] * self.image_shape[1]
         return np.arange(number * size, (number + 1) * size)
 
     def batch(self, pixels: Int64[np.ndarray, "R"]) -> RayBatch:
-        """Rays through the centres of pixels."""
+        """Return the rays through the centres of pixels."""
         height, width = self.image_shape
         image, rest = np.divmod(pixels, height * width)
         row, column = np.divmod(rest, width)
@@ -269,17 +267,10 @@ class RaySource:
         return RayBatch(self._origins[image], directions, lights, rgba[:, :3] * rgba[:, 3:], rgba[:, 3])
 
 
-def camera_rays(camera: Camera) -> tuple[Float32[np.ndarray, "R 3"], Float32[np.ndarray, "R 3"]]:
-    """Origins and directions through all pixel centres of a camera, row by row."""
-    row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
-    directions = camera.ray_directions(np.stack([column + 0.5, row + 0.5], axis=1)).astype(np.float32)
-    return np.broadcast_to(camera.T_world_camera.position.astype(np.float32), directions.shape), directions
-
-
-def shares_of_views(
+def least_opacity(
     points: Float32[np.ndarray, "n 3"], cameras: Sequence[Camera], alphas: Sequence[np.ndarray], allowed_misses: int
-) -> tuple[Float32[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """The smallest opacity that any view shows at points, and which points every view saw within its frame.
+) -> Float32[np.ndarray, "n"]:
+    """Return the smallest opacity that any view shows at points; 1 for points that lie in no view's frame.
 
     Args:
         points: in the set's frame [m].
@@ -288,20 +279,17 @@ def shares_of_views(
         allowed_misses: that many of the smallest values are passed over: single wrong silhouettes carve nothing away.
     """
     least = np.ones((allowed_misses + 1, len(points)), np.float32)
-    framed = np.ones(len(points), bool)
     for camera, alpha in zip(cameras, alphas, strict=True):
         pixels = camera.project(points).astype(np.float32) - 0.5
         inside = np.all((pixels > 0) & (pixels < (camera.width - 1, camera.height - 1)), axis=1)
-        framed &= inside
-        seen = _sample(alpha, pixels)
-        worst = np.where(inside, seen, 1)
+        worst = np.where(inside, _sample(alpha, pixels), 1)
         for row in least:  # keep the few smallest, sorted
             row[:], worst = np.minimum(row, worst), np.maximum(row, worst)
-    return least[-1], framed
+    return least[-1]
 
 
 def _sample(image: Float32[np.ndarray, "h w"], pixels: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n"]:
-    """Bilinear values; OpenCV wants its maps as images of less than 32,768 columns."""
+    """Interpolate an image at pixels; OpenCV wants its maps as images of less than 32,768 columns."""
     width = 4096
     padded = np.zeros((-(-len(pixels) // width) * width, 2), np.float32)
     padded[: len(pixels)] = pixels
@@ -330,7 +318,7 @@ _PIXELS_LOOKED_AT = 400_000
 
 def first_shell(images: ImageSet, box: Float[np.ndarray, "2 3"], *, across: int, cells: int, hidden: int,
                 inside_g: float, rng: np.random.Generator) -> KiloOSF:  # fmt: skip
-    """A coarse field that fills the visual hull, grey all over.
+    """Fill the visual hull with a coarse grey field.
 
     Args:
         images: whose silhouettes carve.
@@ -345,7 +333,7 @@ def first_shell(images: ImageSet, box: Float[np.ndarray, "2 3"], *, across: int,
     points = origin + voxel * np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
     alphas = [cv2.GaussianBlur(a.astype(np.float32) / 255, (0, 0), _BLUR_PX) for a in images.rgba[..., 3]]
     misses = int(_MISSED_SHARE * len(alphas))
-    least = shares_of_views(points.astype(np.float32), images.cameras, alphas, misses)[0].reshape(shape)
+    least = least_opacity(points.astype(np.float32), images.cameras, alphas, misses).reshape(shape)
     g = np.clip((least - _HULL_EDGE) * _EDGE_GAIN, EMPTY_G, inside_g).astype(np.float32)
     smooth = ndimage.gaussian_filter(least, 1.5)
     normals = -np.stack([np.gradient(smooth, axis=axis) for axis in range(3)], axis=-1)
@@ -361,7 +349,7 @@ def first_shell(images: ImageSet, box: Float[np.ndarray, "2 3"], *, across: int,
 
 
 def grid_over(box: Float[np.ndarray, "2 3"], across: int) -> tuple[np.ndarray, float, tuple[int, int, int]]:
-    """Origin [m], voxel side [m] and shape of a grid over a box, one voxel wider on every side."""
+    """Return origin [m], voxel side [m] and shape of a grid over a box, one voxel wider on every side."""
     voxel = float((box[1] - box[0]).max() / across)
     shape = np.ceil((box[1] - box[0]) / voxel - 1e-6).astype(int) + 3
     middle = (box[0] + box[1]) / 2
@@ -372,7 +360,7 @@ def shell_field(
     origin: np.ndarray, voxel: float, features: Float32[np.ndarray, "nx ny nz 8"], keep: Bool[np.ndarray, "nx ny nz"],
     cells: np.ndarray, networks: np.ndarray, ambient: np.ndarray,
 ) -> KiloOSF:  # fmt: skip
-    """A field of some corners of a grid; those on the grid's faces stay empty, so that nothing is cut off.
+    """Make a field of some corners of a grid; those on the grid's faces stay empty, so that nothing is cut off.
 
     Args:
         origin: corner (0, 0, 0) of the grid [m].
@@ -386,17 +374,27 @@ def shell_field(
     keep = keep.copy()
     for axis in range(3):
         np.moveaxis(keep, axis, 0)[[0, -1]] = False
-    index = np.zeros(keep.shape, np.int32)
-    index[keep] = 1 + np.arange(keep.sum(), dtype=np.int32)
-    empty = np.zeros((1, FEATURES), np.float32)
-    empty[0, 0] = EMPTY_G
-    rows = np.concatenate([empty, features[keep]]).astype(np.float32)
+    rows = np.concatenate([EMPTY_ROW, features[keep]]).astype(np.float32)
     hidden = next(h for h in range(1, 257) if network_size(h) == networks.shape[1])
-    return KiloOSF(origin.astype(np.float32), voxel, index, rows, cells, networks, hidden, ambient)
+    return KiloOSF(origin.astype(np.float32), voxel, numbered(keep), rows, cells, networks, hidden, ambient)
+
+
+def reshelled(
+    field: KiloOSF, keep: Bool[np.ndarray, "nx ny nz"], features: Float32[np.ndarray, "nx ny nz 8"] | None = None
+) -> KiloOSF:
+    """Return a field with another shell on the same grid.
+
+    Args:
+        field: gives the grid, the networks and the ambient light.
+        keep: corners that belong to the shell.
+        features: of all corners; the field's own by default.
+    """
+    features = field.rows[field.index] if features is None else features
+    return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)
 
 
 def refine(field: KiloOSF, images: ImageSet, *, across: int, rng: np.random.Generator) -> KiloOSF:
-    """The same field on a finer grid, kept only around the surfaces that some view sees.
+    """Return the same field on a finer grid, kept only around the surfaces that some view sees.
 
     Args:
         field: on the coarse grid.
@@ -420,55 +418,55 @@ def refine(field: KiloOSF, images: ImageSet, *, across: int, rng: np.random.Gene
 
 
 def seen_corners(field: KiloOSF, images: ImageSet, rng: np.random.Generator) -> Bool[np.ndarray, "nx ny nz"]:
-    """The grid corners next to which some pixel's ray finds something.
+    """Find the grid corners next to which some pixel's ray meets something.
 
     Args:
-        field: what is looked at.
+        field: what the rays meet.
         images: the views.
         rng: chooses the pixels to look at, where there are very many.
     """
-    source = RaySource(images)
-    pixels = source.silhouette_pixels()
-    pixels = rng.permutation(pixels)[:_PIXELS_LOOKED_AT]
     seen = np.zeros(field.index.shape, bool)
-    for part in np.array_split(pixels, max(1, len(pixels) // 50_000)):
-        rays = source.batch(part)
-        ts, used = march(field, rays.origins, rays.directions, step=field.voxel / 2, min_weight=_VISIBLE_WEIGHT)
-        points = (rays.origins[:, None] + ts[..., None] * rays.directions[:, None])[used]
-        corners = np.round((points - field.origin) / field.voxel).astype(int)
-        seen[tuple(corners.T)] = True
+    for places in _met(field, images, _VISIBLE_WEIGHT, rng):
+        seen[tuple(np.round(places).astype(int).T)] = True
     return seen
 
 
 def trim(field: KiloOSF, images: ImageSet, needed_weight: float) -> KiloOSF:
-    """The field without the corners that no view of its training set needs: smaller, and it renders the same.
+    """Leave out the corners that no view of the training set needs: the field is smaller and renders the same.
 
     Args:
         field: what was trained.
         images: what it was trained on.
         needed_weight: samples that show less in every view need no corners; above 0.05 it begins to cost quality.
     """
-    source = RaySource(images)
     used = np.zeros(field.index.shape, bool)
-    pixels = source.silhouette_pixels()
-    for part in np.array_split(pixels, max(1, len(pixels) // 50_000)):
-        rays = source.batch(part)
-        ts, found = march(field, rays.origins, rays.directions, step=field.voxel / 2, min_weight=needed_weight)
-        points = (rays.origins[:, None] + ts[..., None] * rays.directions[:, None])[found]
-        used[tuple(np.floor((points - field.origin) / field.voxel).astype(int).T)] = True
+    for places in _met(field, images, needed_weight):
+        used[tuple(np.floor(places).astype(int).T)] = True
     corners = used.copy()
     nx, ny, nz = field.index.shape
     for i, j, k in product((0, 1), repeat=3):  # a voxel needs its eight corners
         corners[i:, j:, k:] |= used[: nx - i, : ny - j, : nz - k]
-    keep = corners & (field.index > 0)
-    features = field.rows[field.index]
-    return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)
+    return reshelled(field, corners & (field.index > 0))
+
+
+def _met(
+    field: KiloOSF, images: ImageSet, min_weight: float, rng: np.random.Generator | None = None
+) -> Iterator[Float32[np.ndarray, "n 3"]]:
+    """Yield what the pixels' rays meet, in voxel coordinates; `rng` chooses some pixels of very many."""
+    source = RaySource(images)
+    pixels = source.silhouette_pixels()
+    if rng is not None:
+        pixels = rng.permutation(pixels)[:_PIXELS_LOOKED_AT]
+    for part in np.array_split(pixels, max(1, len(pixels) // 50_000)):
+        rays = source.batch(part)
+        ts, used = march(field, rays.origins, rays.directions, step=field.voxel / 2, min_weight=min_weight)
+        yield (rays.at(ts)[used] - field.origin) / field.voxel
 
 
 def _moved_cells(
     field: KiloOSF, origin: np.ndarray, voxel: float, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The networks for a box of another size: each new cell starts from the old cell at its centre."""
+    """Return cells and networks for a box of another size: a new cell starts from the old cell at its centre."""
     counts = np.array(field.cells.shape)
     size = voxel * (np.array(shape) - 1)
     centres = origin + size * (np.moveaxis(np.indices(counts.tolist()), 0, -1).reshape(-1, 3) + 0.5) / counts
@@ -479,7 +477,7 @@ def _moved_cells(
 
 
 def _first_networks(count: int, hidden: int, rng: np.random.Generator) -> Float32[np.ndarray, "C P"]:
-    """The same weights in every cell, so that neighbours start in agreement; the output starts near zero."""
+    """Draw the same weights for every cell, so that neighbours start in agreement; the output starts near zero."""
     parts = []
     for inputs, outputs, gain in ((NETWORK_INPUTS, hidden, 1.0), (hidden, hidden, 1.0), (hidden, 3, 0.3)):
         bound = gain * np.sqrt(3 / inputs)

@@ -2,8 +2,8 @@
 
     radiance(x, y, l) = albedo(x, y) * (ambient + l_z * network(l))
 
-The direct part carries the factor l_z, so that it vanishes as the light sinks to the table's plane: that is what tells
-it from the ambient part, although no training image shows a shadow. Shadows remove the direct part.
+The direct part carries the factor l_z, so that it vanishes as the light sinks to the table's plane: this separates it
+from the ambient part, although no training image shows a shadow. Shadows remove the direct part.
 """
 
 from __future__ import annotations
@@ -45,24 +45,22 @@ class TableField:
     b2: Float32[np.ndarray, "3"]
 
     def direct(self, lights: Float[np.ndarray, "B 3"]) -> Float32[np.ndarray, "B 3"]:
-        """What a white point of the table adds under each light, where nothing shades it."""
+        """Return the direct light on a white point of the table under each light, where nothing shades it."""
         hidden = np.maximum(lights.astype(np.float32) @ self.w1 + self.b1, 0)
         return np.maximum(hidden @ self.w2 + self.b2, 0) * np.maximum(lights[:, 2:], 0).astype(np.float32)
 
 
-def write_table(path: Path, table: TableField) -> int:
-    """Write a table; returns the size of the file [bytes].
+def write_table(path: Path, table: TableField) -> None:
+    """Write a table; the file appears only when it is whole.
 
     Raises:
         CannotWrite: if the disk refuses.
     """
-    data = table_bytes(table)
-    write_atomically(path, data)
-    return len(data)
+    write_atomically(path, table_bytes(table))
 
 
 def table_bytes(table: TableField) -> bytes:
-    """A table as the contents of a file."""
+    """Return a table as the contents of a file."""
     tensors = {name: getattr(table, name) for name in _ARRAYS}
     return save({**tensors, "half_side": np.array([table.half_side])}, metadata={"format": TABLE_FORMAT})
 
@@ -77,7 +75,7 @@ def read_table(path: Path) -> TableField:
 
 
 def table_from_bytes(data: bytes, where: Path | str) -> TableField:
-    """A table from the contents of a file.
+    """Make a table from the contents of a file.
 
     Args:
         data: as `table_bytes` makes them.

@@ -2,7 +2,7 @@
 
 Whatever trains them, weights and metrics are written by the process that asked for them: workers may be on other
 machines, which share nothing but the image sets. An object whose worker dies is trained again by an executor that can
-(Dask's does), or by the next run, which leaves alone what is finished: the metrics tell what it was made of.
+(Dask's does), or by the next run, which leaves alone what is finished: the metrics hold what it was made of.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TrainOne = Callable[[Any], Iterator[FieldStep]]
 
 
 class FieldSettings(Protocol):
-    """What one training is told: a dataclass, such as `TrainField`, with a device besides."""
+    """The settings of one training: a dataclass, such as `TrainField`, with a device besides."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
@@ -53,11 +53,19 @@ class _Training:
     def name(self) -> str:
         return self.settings.out.stem
 
+    def record(self, weights: bytes) -> dict[str, Any]:
+        return {**self.made_of, "weights_sha256": hashlib.sha256(weights).hexdigest()}
 
-@dataclass(frozen=True, slots=True)
-class _Trained:
-    weights: bytes
-    metrics: dict[str, Any]
+    def is_finished(self) -> bool:
+        try:
+            weights, metrics = _read(self.settings.out)
+        except (OSError, ValueError):
+            return False
+        return metrics.get(_MADE_OF) == self.record(weights)
+
+    def keep(self, weights: bytes, metrics: dict[str, Any]) -> None:
+        write_atomically(self.settings.out, weights)
+        write_json(self.settings.out.with_suffix(".json"), {**metrics, _MADE_OF: self.record(weights)})
 
 
 def train_several(
@@ -82,9 +90,9 @@ def train_several(
         Finished objects of all; in this process, with the seconds (or steps) of the one that is being trained.
 
     Raises:
-        InvalidInput: if settings are out of range, which is told before anything is trained.
-        CorruptFile: if a set is not sound, which is told in the same way, or nothing could be learned from it: by an
-            executor, told when the others are done.
+        InvalidInput: if settings are out of range; raised before anything is trained.
+        CorruptFile: if a set is not sound; raised before, too. Or if nothing could be learned from it: by an executor,
+            raised when the others are done.
         CannotWrite: if an output cannot be written, which is tried first.
         WorkerDied: if a worker process ended; what was done until then is kept.
     """
@@ -93,7 +101,7 @@ def train_several(
         yield Progress(0, len(settings), f"Reading the images of {one.out.stem}")
         next(train(replace(one, device="cpu")))  # refuses what cannot work; of devices, the worker knows
         training = _Training(one, _made_of(one))
-        if not _is_finished(training):
+        if not training.is_finished():
             missing.append(training)
     done, total = len(settings) - len(missing), len(settings)
     yield Progress(done, total, f"{done} of {total} trained")
@@ -105,31 +113,14 @@ def train_several(
 
 
 def _made_of(settings: FieldSettings) -> dict[str, Any]:
-    """Plain JSON of everything a field depends on, wherever set and output lie."""
+    """Return plain JSON of everything a field depends on, wherever set and output lie."""
     plain = {key: value for key, value in asdict(settings).items() if key not in ("data", "out")}
     return {"settings": plain, "images": [images.digest() for images in read_splits(settings.data)]}
 
 
-def _is_finished(training: _Training) -> bool:
-    try:
-        there = _read(training.settings.out)
-    except (OSError, ValueError):
-        return False
-    return there.metrics.get(_MADE_OF) == _record(training, there.weights)
-
-
-def _record(training: _Training, weights: bytes) -> dict[str, Any]:
-    return {**training.made_of, "weights_sha256": hashlib.sha256(weights).hexdigest()}
-
-
-def _read(out: Path) -> _Trained:
-    return _Trained(out.read_bytes(), json.loads(out.with_suffix(".json").read_text(encoding="utf-8")))
-
-
-def _keep(training: _Training, trained: _Trained) -> None:
-    out = training.settings.out
-    write_atomically(out, trained.weights)
-    write_json(out.with_suffix(".json"), {**trained.metrics, _MADE_OF: _record(training, trained.weights)})
+def _read(out: Path) -> tuple[bytes, dict[str, Any]]:
+    """Read weights and metrics of a training."""
+    return out.read_bytes(), json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
 
 
 def _one_by_one(missing: Sequence[_Training], train: TrainOne, done: int, total: int) -> Iterator[Progress]:
@@ -137,20 +128,19 @@ def _one_by_one(missing: Sequence[_Training], train: TrainOne, done: int, total:
         for step in train(training.settings):
             own = step.progress
             yield Progress(number * own.total + own.done, total * own.total, f"{training.name}: {own.note}")
-        _keep(training, _read(training.settings.out))
+        training.keep(*_read(training.settings.out))
 
 
 def _side_by_side(
     missing: Sequence[_Training], train: TrainOne, executor: Executor, threads: int, shares_disk: bool
 ) -> Iterator[str]:
-    """What was reached, in words, of each object when it is finished and kept."""
-    running: dict[Future[_Trained], _Training] = {}
+    """Yield in words what was reached, when an object is finished and kept."""
+    running: dict[Future[tuple[bytes, dict[str, Any]]], _Training] = {}
     failed: list[OsfError] = []
     try:
         for training in missing:
             settings = replace(training.settings, data=training.settings.data.absolute())
-            work = _trained_beside if shares_disk else _trained_elsewhere
-            running[executor.submit(work, settings, train, threads)] = training
+            running[executor.submit(_trained, settings, train, threads, shares_disk)] = training
         while running:
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in finished:
@@ -158,9 +148,9 @@ def _side_by_side(
                 if isinstance(error := future.exception(), OsfError):  # hours of the others shall not be lost
                     failed.append(error)
                     continue
-                trained = future.result()
-                _keep(training, trained)
-                yield f"{training.name} with {trained.metrics['psnr_full']:.1f} dB held out"
+                weights, metrics = future.result()
+                training.keep(weights, metrics)
+                yield f"{training.name} with {metrics['psnr_full']:.1f} dB held out"
     except BrokenProcessPool as error:
         raise WorkerDied("training a field") from error
     finally:
@@ -170,15 +160,10 @@ def _side_by_side(
         raise failed[0]
 
 
-def _trained_beside(settings: FieldSettings, train: TrainOne, threads: int) -> _Trained:
-    """Train in a worker, with its checkpoints beside the output."""
-    with computing_threads(threads):
+def _trained(settings: FieldSettings, train: TrainOne, threads: int, shares_disk: bool) -> tuple[bytes, dict[str, Any]]:
+    """Train in a worker, beside the output or where that may be out of reach; return weights and metrics."""
+    with TemporaryDirectory() as folder, computing_threads(threads):
+        settings = settings if shares_disk else replace(settings, out=Path(folder) / settings.out.name)
         for _ in train(settings):
             pass
-    return _read(settings.out)
-
-
-def _trained_elsewhere(settings: FieldSettings, train: TrainOne, threads: int) -> _Trained:
-    """Train in a worker that may not see the output."""
-    with TemporaryDirectory() as folder:
-        return _trained_beside(replace(settings, out=Path(folder) / settings.out.name), train, threads)
+        return _read(settings.out)

@@ -1,4 +1,4 @@
-"""Training the table's field."""
+"""Training the table's field from images of the bare table under many lights. It takes less than a minute."""
 
 from __future__ import annotations
 
@@ -17,18 +17,16 @@ from osfcore.errors import CorruptFile, InvalidInput, check_seed
 from osfcore.fields.devices import pick_device
 from osfcore.fields.rays import RayBatch, RaySource
 from osfcore.fields.table import TableField, table_bytes, table_from_bytes
+from osfcore.fields.train_osf import Rates, descend
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.image_set import ImageSet, read_splits
 from osfcore.io.output_paths import check_weights_place
 from osfcore.progress import Progress
 
-# Training the table's field from images of the bare table under many lights. It takes less than a minute.
-
-
 _HIDDEN = 16
 _GRID = 16
-_RATES = (2e-2, 2e-4)
+_RATES = Rates(2e-2, 2e-4)
 _REPORT_EVERY = 50
 _OWN_METRICS = ("psnr", "test_images")  # by which a file of metrics is known
 _EDGE_M = 0.02  # pixels that straddle the table's edge belong to nobody
@@ -103,50 +101,33 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
     rng = np.random.default_rng(config.seed)
     model = _Model().to(device)
     optimiser = torch.optim.Adam(model.parameters(), fused=True)
-    source = RaySource(train)
-    pixels = train.rgba[..., 0].size
+    source, pixels, half = RaySource(train), train.rgba[..., 0].size, TABLE_SIDE_M / 2
     for done in range(config.iterations):
         for group in optimiser.param_groups:
-            group["lr"] = _RATES[0] * (_RATES[1] / _RATES[0]) ** (done / config.iterations)
-        places, lights, truth, where = _batch(source, rng.integers(pixels, size=config.rays), device)
-        on_table, beyond = where
+            group["lr"] = _RATES.at(done / config.iterations)
+        rays = source.batch(rng.integers(pixels, size=config.rays))
+        where, reach = _meet_plane(rays)
+        ends = where, rays.lights, rays.rgb, reach < half - _EDGE_M, reach > half + _EDGE_M
+        places, lights, truth, on_table, beyond = (torch.as_tensor(a, device=device) for a in ends)
         loss = functional.mse_loss(model(places[on_table], lights[on_table]), truth[on_table])
         if beyond.any():
             loss = loss + functional.mse_loss(model.background.expand(int(beyond.sum()), 3), truth[beyond])
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
+        found = descend(optimiser, loss)
         if done % _REPORT_EVERY == 0:
-            yield Progress(
-                done, config.iterations, f"{-10 * np.log10(float(loss.detach()) + 1e-10):.1f} dB on its own images"
-            )
-    yield _finish(config, model, train, test, device)
-
-
-def _finish(config: TrainTable, model: _Model, train: ImageSet, test: ImageSet, device: torch.device) -> Progress:
+            yield Progress(done, config.iterations, f"{-10 * np.log10(found + 1e-10):.1f} dB on its own images")
     data = table_bytes(model.to_field())
     psnr = _measure(table_from_bytes(data, "The trained table"), test)
-    size = len(data)
     metrics = {"psnr": round(psnr, 3), "test_images": len(test.cameras), "train_images": len(train.cameras),
-               "bytes": size, "iterations": config.iterations, "seed": config.seed, "device": str(device),
+               "bytes": len(data), "iterations": config.iterations, "seed": config.seed, "device": str(device),
                "data": config.data.name}  # fmt: skip
     write_atomically(config.out, data)
     write_json(config.out.with_suffix(".json"), metrics)
-    return Progress(config.iterations, config.iterations, f"{psnr:.2f} dB held out, {size / 1000:.0f} kB")
-
-
-def _batch(source: RaySource, pixels: np.ndarray, device: torch.device):  # noqa: ANN202
-    """Places on the plane, lights, colours, and which rays end on the table and which beyond it."""
-    rays = source.batch(pixels)
-    places, reach = _meet_plane(rays)
-    half = TABLE_SIDE_M / 2
-    tensors = [torch.as_tensor(a, device=device) for a in (places, rays.lights, rays.rgb)]
-    where = [torch.as_tensor(a, device=device) for a in (reach < half - _EDGE_M, reach > half + _EDGE_M)]
-    return *tensors, where
+    words = f"{psnr:.2f} dB held out, {len(data) / 1000:.0f} kB"
+    yield Progress(config.iterations, config.iterations, words)
 
 
 def _meet_plane(rays: RayBatch) -> tuple[Float32[np.ndarray, "R 2"], Float32[np.ndarray, "R"]]:
-    """Where rays meet z = 0 [m], and the larger of |x| and |y| there; infinite for rays that do not."""
+    """Return where rays meet z = 0 [m], and the larger of |x| and |y| there; infinite for rays that do not."""
     down = rays.directions[:, 2] < -1e-6
     distance = np.where(down, -rays.origins[:, 2] / np.where(down, rays.directions[:, 2], 1), 0)
     places = (rays.origins + distance[:, None] * rays.directions)[:, :2].astype(np.float32)
@@ -154,7 +135,7 @@ def _meet_plane(rays: RayBatch) -> tuple[Float32[np.ndarray, "R 2"], Float32[np.
 
 
 def _measure(table: TableField, test: ImageSet) -> float:
-    """Mean PSNR over whole held-out images, the pixels that straddle the edge included [dB]."""
+    """Return the mean PSNR over whole held-out images, with the pixels that straddle the edge [dB]."""
     source = RaySource(test)
     values = []
     for number in range(len(test.cameras)):

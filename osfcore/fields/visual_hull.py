@@ -51,7 +51,7 @@ class Hull:
 
 
 def silhouette_box(*sets: ImageSet, where: Path | str = "The image set") -> Float[np.ndarray, "2 3"]:
-    """The axis-aligned box of the object: least and greatest corner, in the set's unit of length.
+    """Return the axis-aligned box of the object: least and greatest corner, in the set's unit of length.
 
     Args:
         *sets: images of one object, each with a silhouette; the more, the tighter.
@@ -74,24 +74,16 @@ def silhouette_box(*sets: ImageSet, where: Path | str = "The image set") -> Floa
         names = ", ".join(cameras[i].name for i in wrong[:5]) + (", ..." if len(wrong) > 5 else "")
         expected = "check their RT, K and masks"
         raise CorruptFile(where, f"the silhouettes of {names} contradict those of all other images: {expected}")
-    _refuse_scale(hull.box, where)
+    side, farthest = float(np.ptp(hull.box, axis=0).max()), float(np.abs(hull.box).max())
+    if not (side >= MIN_SIDE and farthest <= MAX_COORDINATE and farthest <= MAX_OFFSET * side):
+        found = f"its object is {side:.3g} large and lies at coordinates up to {farthest:.3g}"
+        bounds = f"coordinates up to {MAX_COORDINATE:g} and up to {MAX_OFFSET:g} times the size"
+        raise CorruptFile(where, f"{found}; a size from {MIN_SIDE:g}, {bounds} can be held")
     return hull.box
 
 
-def _refuse_scale(box: Float[np.ndarray, "2 3"], where: Path | str) -> None:
-    side, farthest = float(np.ptp(box, axis=0).max()), float(np.abs(box).max())
-    if not (side >= MIN_SIDE and farthest <= MAX_COORDINATE and farthest <= MAX_OFFSET * side):
-        expected = (
-            f"a size from {MIN_SIDE:g}, coordinates up to {MAX_COORDINATE:g} and up to {MAX_OFFSET:g} times the size"
-        )
-        raise CorruptFile(
-            where,
-            f"its object is {side:.3g} large and lies at coordinates up to {farthest:.3g}; {expected} can be held",
-        )
-
-
 def carve(*sets: ImageSet, resolution: int = 32) -> Hull:
-    """The visual hull on a grid of `resolution` cells a side; it judges nothing and works on contradicting views, too.
+    """Carve the visual hull on a grid of `resolution` cells a side, even from views that contradict each other.
 
     Views are numbered through all sets, every image of which must have a silhouette. A cell stays where silhouettes
     meet it: the hull errs on the large side by about a cell.
@@ -134,7 +126,7 @@ class _View:
         return _View(camera, mask, camera.intrinsics @ camera.T_world_camera.inverse().matrix()[:3])
 
     def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Columns, rows [px] and depths; points behind the camera land outside of any image."""
+        """Return columns, rows [px] and depths; points behind the camera land outside of any image."""
         projected = points @ self.P[:, :3].T + self.P[:, 3]
         depth = projected[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -143,7 +135,7 @@ class _View:
         return np.floor(pixels[:, 0]).astype(np.int32), np.floor(pixels[:, 1]).astype(np.int32), depth
 
     def meets(self, centres: Float[np.ndarray, "n 3"], radius: float) -> Bool[np.ndarray, "n"]:
-        """Whether balls around the centres meet the silhouette, or could beyond a border that it touches."""
+        """Return whether balls around the centres meet the silhouette, or could beyond a border that it touches."""
         height, width = self.mask.shape
         distance = cv2.distanceTransform(1 - self.mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         u, v, depth = self.project(centres)
@@ -155,7 +147,7 @@ class _View:
         return (depth > 0) & (is_near | is_hidden)
 
     def cover(self, centres: Float[np.ndarray, "n 3"], radius: float) -> float:
-        """Share of the silhouette within reach of balls around the centres."""
+        """Return the share of the silhouette within reach of balls around the centres."""
         height, width = self.mask.shape
         u, v, depth = self.project(centres)
         is_seen = (depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
@@ -168,7 +160,7 @@ class _View:
         return float(np.mean(distance[self.mask] <= reach))
 
     def half_spaces(self) -> Float[np.ndarray, "k 4"]:
-        """Rows (n, d) with n x + d >= 0 for every point of the object: in front, and within the mask's rectangle.
+        """Return rows (n, d) with n x + d >= 0 for every point of the object: in front, within the mask's rectangle.
 
         Beyond a border that the silhouette touches the object may go on: that side bounds nothing, nor do the two
         sides across it.
@@ -192,7 +184,7 @@ class _View:
 
 
 def _region(views: Sequence[_View]) -> tuple[Float[np.ndarray, "2 3"], bool]:
-    """A box around the intersection of the views' cones, and whether they enclose anything.
+    """Return a box around the intersection of the views' cones, and whether they enclose anything.
 
     Contradicting views are left out; where the rest encloses nothing, it is a box as large as the silhouettes around
     the point at which the views look.
@@ -217,7 +209,7 @@ def _region(views: Sequence[_View]) -> tuple[Float[np.ndarray, "2 3"], bool]:
 
 
 def _focus(planes: Sequence[Float[np.ndarray, "_ 4"]]) -> tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "n"]]:
-    """The point that violates the cones of the views least in sum, and which of them contain it."""
+    """Return the point that violates the cones of the views least in sum, and which of them contain it."""
     rows = np.concatenate(planes)
     owner = np.repeat(np.arange(len(planes)), [len(p) for p in planes])
     slack = sparse.csr_array((-np.ones(len(rows)), (np.arange(len(rows)), owner)), shape=(len(rows), len(planes)))
@@ -231,7 +223,7 @@ def _focus(planes: Sequence[Float[np.ndarray, "_ 4"]]) -> tuple[Float[np.ndarray
 
 
 def _bounds(rows: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "2 3"] | None:
-    """Least and greatest coordinates where all half spaces meet; None where they do not."""
+    """Return least and greatest coordinates where all half spaces meet; None where they do not."""
     box = np.zeros((2, 3))
     for axis in range(3):
         for side, sign in enumerate((1, -1)):

@@ -15,11 +15,13 @@ import numpy as np
 from osfcore.fields.kiloosf import FEATURES, MACRO_BITS, MOST_HIDDEN, NETWORK_INPUTS
 from osfcore.fields.rays import interpolate, inverted, leave_blocks, optical_density, within
 
-# How kernels and their helpers are compiled, and the numbers that all of them know.
+# How kernels and their helpers are compiled, and the numbers that all of them use.
 
 
 FAR = np.float32(1e9)
 TINY = np.float32(1e-9)
+_ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(n) for n in (0, 0.5, 1, 2, 3))
+_1, _2, _3, _4 = (np.uint64(n) for n in (1, 2, 3, 4))  # steps of indices
 GONE, STILL, MOVES = 0, 1, 2  # an object that is not there, or that is in the base, or in the scene alone
 HELPER: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
 KERNEL: dict[str, Any] = {"parallel": True, "fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
@@ -32,21 +34,19 @@ KERNEL: dict[str, Any] = {"parallel": True, "fastmath": True, "error_model": "nu
 # that outputs are stored and loaded less often.
 
 
-_LAYER: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
 ANY = np.float32(-np.finfo(np.float32).max)  # floor of inputs that are taken as they are
-_BYTE_1, _BYTE_2, _BYTE_3, _BYTE_4 = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
 
 
-@numba.njit(**_LAYER)
+@numba.njit(**HELPER)
 def dense_layer(flat, at, inputs, floor, count, width, outputs):
-    """outputs[n] = b[n] + sum_m max(inputs[m], floor) * W[m, n].
+    """Compute outputs[n] = b[n] + sum_m max(inputs[m], floor) * W[m, n].
 
     Args:
         flat: parameters: W row by row, then b.
         at: where they begin.
-        inputs: the first `count` count.
+        inputs: only the first `count` are used.
         floor: 0 for the outputs of a layer that is followed by ReLU; `ANY` otherwise.
-        count: of inputs.
+        count: number of inputs.
         width: number of outputs.
         outputs: result.
 
@@ -56,58 +56,55 @@ def dense_layer(flat, at, inputs, floor, count, width, outputs):
     size, row, first = np.uint64(width), np.uint64(at), np.uint64(((count - 1) & 3) + 1)
     bias = row + np.uint64(count) * size
     a = max(inputs[np.uint64(0)], floor)
-    b = max(inputs[_BYTE_1], floor) if first > _BYTE_1 else _ZERO
-    c = max(inputs[_BYTE_2], floor) if first > _BYTE_2 else _ZERO
-    d = max(inputs[_BYTE_3], floor) if first > _BYTE_3 else _ZERO
-    second = row + size if first > _BYTE_1 else row
-    third = row + _BYTE_2 * size if first > _BYTE_2 else row
-    fourth = row + _BYTE_3 * size if first > _BYTE_3 else row
+    b = max(inputs[_1], floor) if first > _1 else _ZERO
+    c = max(inputs[_2], floor) if first > _2 else _ZERO
+    d = max(inputs[_3], floor) if first > _3 else _ZERO
+    second = row + size if first > _1 else row
+    third = row + _2 * size if first > _2 else row
+    fourth = row + _3 * size if first > _3 else row
     for k in range(width):
         n = np.uint64(k)
         some = a * flat[row + n] + b * flat[second + n] + c * flat[third + n] + d * flat[fourth + n]
         outputs[n] = flat[bias + n] + some
     m, row = first, row + first * size
     for _ in range((count - 1) >> 2):
-        a, b = max(inputs[m], floor), max(inputs[m + _BYTE_1], floor)
-        c, d = max(inputs[m + _BYTE_2], floor), max(inputs[m + _BYTE_3], floor)
-        second, third, fourth = row + size, row + _BYTE_2 * size, row + _BYTE_3 * size
+        a, b = max(inputs[m], floor), max(inputs[m + _1], floor)
+        c, d = max(inputs[m + _2], floor), max(inputs[m + _3], floor)
+        second, third, fourth = row + size, row + _2 * size, row + _3 * size
         for k in range(width):
             n = np.uint64(k)
             outputs[n] += a * flat[row + n] + b * flat[second + n] + c * flat[third + n] + d * flat[fourth + n]
-        m, row = m + _BYTE_4, row + _BYTE_4 * size
+        m, row = m + _4, row + _4 * size
     return at + (count + 1) * width
 
 
-@numba.njit(**_LAYER)
+@numba.njit(**HELPER)
 def three_outputs(flat, at, inputs, count):
-    """The outputs of a layer that has three, of inputs after ReLU; arguments as in `dense_layer`."""
-    row, bias = np.uint64(at), np.uint64(at) + _BYTE_3 * np.uint64(count)
-    x, y, z = flat[bias], flat[bias + _BYTE_1], flat[bias + _BYTE_2]
+    """Return the outputs of a layer that has three, of inputs after ReLU; arguments as in `dense_layer`."""
+    row, bias = np.uint64(at), np.uint64(at) + _3 * np.uint64(count)
+    x, y, z = flat[bias], flat[bias + _1], flat[bias + _2]
     for m in range(count):
         value = max(inputs[np.uint64(m)], _ZERO)
         x += value * flat[row]
-        y += value * flat[row + _BYTE_1]
-        z += value * flat[row + _BYTE_2]
-        row += _BYTE_3
+        y += value * flat[row + _1]
+        z += value * flat[row + _2]
+        row += _3
     return x, y, z
 
 
 # Compiled light of near lamps: where it comes from at a point, and how much of it arrives.
 #
 # Kernels and helpers take `lamps`: `renderer.Lamps`, or None under distant lights. Numba compiles one version for
-# each, and leaves out of it what the other one asks for: distant lights cost nothing because there are lamps, and
-# change no bit.
-
-
-_THREE = np.float32(3)
+# each, without the branches of the other: distant lights cost nothing more because there are lamps, and their images
+# stay the same to the bit.
 
 
 @numba.njit(**HELPER)
 def toward_lamp(lamps, b, n, x, y, z, voxel):
-    """Unit vector from a point toward the lamp of scene b, along the axes of object n, and the distance [m].
+    """Return the unit vector from a point toward the lamp of scene b, along the axes of object n, and its distance [m].
 
     Args:
-        lamps: `lamps.Lamps`.
+        lamps: `renderer.Lamps`.
         b, n: scene, and object; n = N stands for the world.
         x, y, z: the point, in voxel coordinates of the object or in the world.
         voxel: the unit of these coordinates [m].
@@ -120,7 +117,7 @@ def toward_lamp(lamps, b, n, x, y, z, voxel):
 
 @numba.njit(**HELPER)
 def lamp_gain(lamps, b, n, lx, ly, lz, distance):
-    """Share of the diffuse light that arrives unshaded, `SpotLamp.spot_factor` times `SpotLamp.falloff`.
+    """Return the share of the diffuse light that arrives unshaded: `SpotLamp.spot_factor` times `SpotLamp.falloff`.
 
     Args:
         lamps, b, n: as in `toward_lamp`.
@@ -134,7 +131,7 @@ def lamp_gain(lamps, b, n, lx, ly, lz, distance):
 
 @numba.njit(**HELPER)
 def light_on_table(lamps, b, x, y):
-    """Direct light of three colours on a white table at a point of it [m] where nothing shades it."""
+    """Return direct light of three colours on a white table at a point of it [m] where nothing shades it."""
     n = lamps.position.shape[1] - 1
     lx, ly, lz, distance = toward_lamp(lamps, b, n, x, y, _ZERO, _ONE)
     red, green, blue = lamps.b2[0], lamps.b2[1], lamps.b2[2]
@@ -153,16 +150,12 @@ def light_on_table(lamps, b, x, y):
 # Conventions of coordinates, types and inlining are those of the ray marching below.
 
 
-_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_NEXT = np.uint64(1)
-
-
 @numba.njit(**HELPER)
 def clip_to_extent(reach, n, ox, oy, oz, ix, iy, iz, far, step):
-    """First and last sample of a ray within the occupied part of an object; last < first: none.
+    """Return the first and last sample of a ray within the occupied part of an object; last < first: none.
 
     Args:
-        reach, n: occupied parts (`launch.Scene`), and which one.
+        reach, n: occupied parts (`renderer.Scene`), and which one.
         ox, oy, oz: ray origin in the object's voxel coordinates.
         ix, iy, iz: components of its direction [voxels/m], inverted.
         far: where the ray ends [m].
@@ -181,10 +174,10 @@ def clip_to_extent(reach, n, ox, oy, oz, ix, iy, iz, far, step):
 
 @numba.njit(**HELPER)
 def next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, step_voxels):
-    """The next sample of a field with any density, and its optical depth; past `last` if there is none.
+    """Find the next sample of a field with any density, and its optical depth; past `last` if there is none.
 
     Args:
-        pack, a: fields (`packing.Packed`), and which one.
+        pack, a: fields (`renderer.Packed`), and which one.
         ox, oy, oz: ray origin in the field's voxel coordinates.
         dx, dy, dz: its direction [voxels/m]; ix, iy, iz: each component inverted.
         k, last: sample to begin with, and the ray's last one.
@@ -214,7 +207,7 @@ def next_sample(pack, a, ox, oy, oz, dx, dy, dz, ix, iy, iz, k, last, step, step
 
 @numba.njit(**HELPER)
 def _depth_to_light(pack, a, n, scene, lamps, b, x, y, z, step, step_voxels, enough):
-    """Optical depth of object n between a point, in its voxel coordinates, and the light; stops when it is enough."""
+    """Return the optical depth of object n between a point, in its voxel coordinates, and the light, up to `enough`."""
     if lamps is None:
         dx, dy, dz, far = scene.lit[b, n, 0], scene.lit[b, n, 1], scene.lit[b, n, 2], FAR
         ix, iy, iz = scene.lit_inverse[b, n, 0], scene.lit_inverse[b, n, 1], scene.lit_inverse[b, n, 2]
@@ -234,7 +227,7 @@ def _depth_to_light(pack, a, n, scene, lamps, b, x, y, z, step, step_voxels, eno
 
 @numba.njit(**HELPER)
 def _transform(matrix, b, n, m, x, y, z):
-    """A point in object n's voxel coordinates in those of object m; n = N stands for the world."""
+    """Turn a point in object n's voxel coordinates into those of object m; n = N stands for the world."""
     return (
         matrix[b, n, m, 0] * x + matrix[b, n, m, 1] * y + matrix[b, n, m, 2] * z + matrix[b, n, m, 3],
         matrix[b, n, m, 4] * x + matrix[b, n, m, 5] * y + matrix[b, n, m, 6] * z + matrix[b, n, m, 7],
@@ -244,10 +237,10 @@ def _transform(matrix, b, n, m, x, y, z):
 
 @numba.njit(**HELPER)
 def light_transmittance(pack, fields, scene, lamps, b, n, x, y, z, step_voxels, enough):
-    """Share of the light that reaches a point of object n past all other objects; n = N: a point of the world.
+    """Return the share of the light that reaches a point of object n past all others; n = N: a point of the world.
 
     Args:
-        pack, fields, scene, lamps: as in `kernels.render_batch`.
+        pack, fields, scene, lamps: as in `render_batch`.
         b, n: scene, and object that does not shade the point.
         x, y, z: the point, in voxel coordinates of object n or in the world [m].
         step_voxels: between samples of the shadow ray [voxels].
@@ -267,7 +260,7 @@ def light_transmittance(pack, fields, scene, lamps, b, n, x, y, z, step_voxels, 
 
 @numba.njit(**HELPER)
 def _scatter(pack, a, px, py, pz, lx, ly, lz, vx, vy, vz, inputs, h1, h2, out):
-    """Rho of field a at voxel coordinates: ambient part in out[0:3], direct part in out[3:6]."""
+    """Evaluate rho of field a at voxel coordinates: ambient part into out[0:3], direct part into out[3:6]."""
     nx, ny, nz = pack.shapes[a, 0], pack.shapes[a, 1], pack.shapes[a, 2]
     _mix_features(pack, a, px, py, pz, ny, nz, h1)
     f1, f2, f3 = h1[1], h1[2], h1[3]
@@ -293,7 +286,7 @@ def _scatter(pack, a, px, py, pz, lx, ly, lz, vx, vy, vz, inputs, h1, h2, out):
 
 @numba.njit(**HELPER)
 def _mix_features(pack, a, px, py, pz, ny, nz, mixed) -> None:
-    """The features at voxel coordinates of field a, interpolated between eight corners, into mixed[0:FEATURES]."""
+    """Interpolate the features of field a between the eight corners around a point, into mixed[0:FEATURES]."""
     i, j, k = int(px), int(py), int(pz)
     fx, fy, fz = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
     start, first = pack.starts[a, 0] + (i * ny + j) * nz + k, pack.starts[a, 1]
@@ -304,7 +297,7 @@ def _mix_features(pack, a, px, py, pz, ny, nz, mixed) -> None:
         w = (fx if ci else _ONE - fx) * (fy if cj else _ONE - fy)
         here = np.uint64(start + (ci * ny + cj) * nz)
         one = np.uint64((first + pack.index[here]) * FEATURES)
-        two = np.uint64((first + pack.index[here + _NEXT]) * FEATURES)
+        two = np.uint64((first + pack.index[here + _1]) * FEATURES)
         low, high = w * (_ONE - fz), w * fz
         for c in range(FEATURES):
             mixed[np.uint64(c)] += low * pack.rows[one + np.uint64(c)] + high * pack.rows[two + np.uint64(c)]
@@ -312,17 +305,17 @@ def _mix_features(pack, a, px, py, pz, ny, nz, mixed) -> None:
 
 @numba.njit(**HELPER)
 def radiance_at(pack, fields, scene, lamps, b, n, t, rules, work):
-    """Rho of object n where the ray of `work` is at t, left in work.out[0:6].
+    """Evaluate rho of object n where the ray of `work` is at t, into work.out[0:6].
 
     Args:
-        pack, fields, scene, lamps, rules: as in `kernels.render_batch`.
+        pack, fields, scene, lamps, rules: as in `render_batch`.
         b, n: scene and object.
         t: distance from the camera [m].
         work: the thread's ray and memory; light found before is kept in it, for `rules.one_shadow`.
 
     Returns:
-        Transmittance from there toward the light, times what a lamp's distance and cone leave of it; 0, unasked, where
-        the object scatters no direct light or the lamp sheds none.
+        Transmittance from there toward the light, times what a lamp's distance and cone leave of it; 0 without a
+        shadow ray where the object scatters no direct light or the lamp sheds none.
     """
     d, inputs, h1, h2, out = work.direction, work.inputs, work.h1, work.h2, work.out
     a, view = fields[n], work.where[0]
@@ -348,7 +341,7 @@ def radiance_at(pack, fields, scene, lamps, b, n, t, rules, work):
 
 @numba.njit(**HELPER)
 def pixel_ray(cameras, view, u, v):
-    """Unit direction in the world through a place of the image, and 1 / the length it had.
+    """Return the unit direction in the world through a place of the image, and 1 / the length it had.
 
     Args:
         cameras, view: V x 12 numbers of `types.camera_numbers`, and which camera.
@@ -363,10 +356,10 @@ def pixel_ray(cameras, view, u, v):
 
 @numba.njit(**HELPER)
 def meet_table(table, cameras, view, dx, dy, dz):
-    """Distance along a camera's ray to the table [m]; `FAR` if it misses.
+    """Return the distance along a camera's ray to the table [m]; `FAR` if it misses.
 
     Args:
-        table: `launch.Table`.
+        table: `renderer.Table`.
         cameras, view: as in `pixel_ray`.
         dx, dy, dz: unit direction in the world.
     """
@@ -380,10 +373,10 @@ def meet_table(table, cameras, view, dx, dy, dz):
 
 @numba.njit(**HELPER)
 def table_colour(table, directs, lamps, b, x, y, visible):
-    """Radiance of the table at a point of it.
+    """Return the radiance of the table at a point of it.
 
     Args:
-        table: `launch.Table`.
+        table: `renderer.Table`.
         directs, lamps, b: direct light of distant lights on a white table (a row for each), lamps, and which row.
         x, y: the point in the world [m].
         visible: transmittance from there toward the light.
@@ -414,10 +407,10 @@ def table_colour(table, directs, lamps, b, x, y, visible):
 
 @numba.njit(**HELPER)
 def empty_pixel(table, cameras, directs, lamps, b, view, row, column, samples):
-    """Colour of a pixel of the empty, unshaded table, and its distance [m], 0 where there is no table.
+    """Return the colour of a pixel of the empty, unshaded table, and its distance [m], 0 where there is no table.
 
     Args:
-        table: `launch.Table`.
+        table: `renderer.Table`.
         cameras, directs, lamps, b: as in `table_colour`.
         view, row, column: the pixel.
         samples: rays along each side of a pixel that straddles the table's edge; elsewhere one ray is exact enough,
@@ -459,11 +452,11 @@ def empty_pixel(table, cameras, directs, lamps, b, view, row, column, samples):
 MOST_OBJECTS = 24
 NO_OUTLINE = np.float32(1e8)
 BAND_ROWS = 4  # rows of an image that one thread draws at a time
-_FAINT = np.float32(1e-3)  # of a pixel that shows anything less, the distance is not told
+_FAINT = np.float32(1e-3)  # weight of what a pixel shows below which its distance is 0
 
 
 class _Work(NamedTuple):
-    """What one thread writes on."""
+    """The memory of one thread."""
 
     direction: np.ndarray
     inverse: np.ndarray
@@ -519,7 +512,7 @@ def _start_ray(pack, fields, scene, b, view, u, v, unit, table_t, near, rules, w
 
 @numba.njit(**HELPER)
 def _nearest_sample(pack, fields, rules, work):
-    """The object whose next sample is nearest and the distance of that sample [m]; -1 if all are past their last."""
+    """Return the object whose next sample is nearest, and its distance [m]; -1 if all are past their last."""
     n, t = -1, FAR
     for m in range(len(fields)):
         if work.ks[m] <= work.lasts[m]:
@@ -599,7 +592,7 @@ def _trace(pack, table, fields, scene, lamps, cameras, b, view, u, v, near, rule
 
 @numba.njit(**HELPER)
 def _row_span(outlines, boxes, b, view, n, row, count):
-    """The columns of a row of pixels, from and to, that the outline of object n may touch.
+    """Return the columns of a row of pixels, from and to, that the outline of object n may touch.
 
     The outline is the convex hull of `count` points; between any two of them a line lies in it, and some are its edges.
     """
@@ -627,12 +620,12 @@ def _row_span(outlines, boxes, b, view, n, row, count):
 
 @numba.njit(**HELPER)
 def _row_spans(scene, b, view, row, count, width, spans):
-    """Columns of a row that each object may touch (spans 0, 1), and the shadow of each that moves (2, 3).
+    """Fill in the columns of a row that each object (spans 0, 1) and the shadow of each that moves (2, 3) may touch.
 
-    And what these may shade (4, 5), which is left empty where no other objects are still.
+    Spans 4 and 5 hold what these may shade; they are empty where no other objects are still.
 
     Returns:
-        Columns, from and to, that what moves may change.
+        Columns, from and to, that moving objects may change.
     """
     first, last, has_still = width, 0, False
     for n in range(count):
@@ -655,7 +648,7 @@ def _row_spans(scene, b, view, row, count, width, spans):
 
 @numba.njit(**HELPER)
 def _is_touched(scene, b, column, count, spans, near):
-    """Whether a pixel may show anything but the base; marks the objects that it may show."""
+    """Return whether a pixel may show anything but the base, and mark the objects that it may show."""
     touched = shaded = shows_still = False
     for n in range(count):
         near[n] = spans[n, 0] <= column < spans[n, 1]
@@ -669,7 +662,7 @@ def _is_touched(scene, b, column, count, spans, near):
 
 @numba.njit(**HELPER)
 def _trace_pixel(pack, table, fields, scene, lamps, cameras, b, view, row, column, rules, work) -> None:
-    """Sum of the rays of one pixel, left in work.total."""
+    """Sum up the rays of one pixel in work.total."""
     total, result, samples = work.total, work.result, rules.samples
     for c in range(5 + len(fields)):
         total[c] = _ZERO
@@ -683,7 +676,7 @@ def _trace_pixel(pack, table, fields, scene, lamps, cameras, b, view, row, colum
 
 @numba.njit(**HELPER)
 def _show_base(table, scene, lamps, cameras, base, b, view, row, column, rules, rgb, opacity, distance) -> None:
-    """A pixel that shows nothing of the scene's own: the base, or the empty table where there is none."""
+    """Draw a pixel that shows nothing of the scene's own: the base, or the empty table where there is none."""
     at = base.of[b]
     if at < 0:
         red, green, blue, t = empty_pixel(table, cameras, scene.direct, lamps, b, view, row, column, rules.samples)
@@ -706,11 +699,11 @@ def _put(rgb, distance, b, view, row, column, red, green, blue, t) -> None:
 
 @numba.njit(**KERNEL)
 def render_batch(pack, table, fields, scene, lamps, cameras, base, rules, only, stride, rgb, opacity, distance) -> None:
-    """Every image of a batch.
+    """Render every image of a batch.
 
     Args:
         pack, fields: packed fields, and that of each of N objects.
-        table, scene, base, rules: types of `launch`.
+        table, scene, base, rules: types of `renderer`.
         lamps, cameras: `Lamps`, or None; V x 12 `types.camera_numbers`.
         only: V x h x w, 0 for pixels that stay black, or empty.
         stride: from one band of rows to the next that a thread draws, coprime to the number of bands: threads share

@@ -9,35 +9,7 @@ compositional NeRFs), not their sum, so that overlapping objects do not shine tw
 reaches a point is the transmittance of all other objects along the ray toward the light, the limit of a shadow map of
 unlimited resolution.
 
-Its primitives go from densities at samples to the weight of each sample and to a pixel's value.
-
-Emission and absorption along a ray r(t) = o + t d (paper eq. 3, NeRF eq. 1) are
-
-    L = integral of T(t) sigma(r(t)) L_out(r(t)) dt,        T(t) = exp(-integral from t_n to t of sigma(r(s)) ds).
-
-With density and radiance constant over intervals of length delta_i, this is exactly the sum
-
-    tau_i   = sigma_i delta_i                               optical thickness
-    alpha_i = 1 - exp(-tau_i)                               share of the light that interval i absorbs and scatters
-    T_i     = exp(-sum of tau_j over j < i)                 share that reaches interval i
-    w_i     = T_i alpha_i                                   weight of sample i
-    L       = sum of w_i L_i + T_end L_behind,              T_end = exp(-sum of all tau_i).
-
-A worked example: one ray with an empty sample and two that each let half of the light through.
-
-    >>> taus = torch.log(torch.tensor([[1.0, 2.0, 2.0]]))
-    >>> alphas_from_thickness(taus).tolist()
-    [[0.0, 0.5, 0.5]]
-    >>> transmittance(taus).tolist()
-    [[1.0, 1.0, 0.5]]
-    >>> weights = render_weights(taus)
-    >>> weights.tolist()
-    [[0.0, 0.5, 0.25]]
-    >>> final_transmittance(taus).tolist()
-    [0.25]
-    >>> red_then_blue = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
-    >>> accumulate_along_rays(weights, red_then_blue).tolist()
-    [[0.5, 0.0, 0.25]]
+Densities become weights and pixels as `osfcore.fields.volume_rendering` explains.
 """
 
 from __future__ import annotations
@@ -49,46 +21,46 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import grid_sample, normalize
 
 from osfcore.fields.kiloosf import EMPTY_G, FEATURES, KiloOSF, network_size
 from osfcore.fields.kiloosf_query import KiloQuery
 from osfcore.fields.rays import shell_field
 from osfcore.fields.table import TableField
+from osfcore.fields.volume_rendering import accumulate_along_rays, final_transmittance, render_weights
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_PENUMBRA_RAD, SpotLamp
-from osfcore.geometry.poses import quaternion_to_matrix
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
-from osfcore.render.types import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
+from osfcore.render.types import EXACT, Quality, Rendered, SceneBatch, camera_numbers, check_request, poses_of
 
-# The lights of the reference renderer: what points of the world see of a distant one, and of a near lamp.
+# The lights: what points of the world receive from a distant one, and from a near lamp.
 #
-# Both answer the same four questions. `SpotLamp` has the equations of the lamp.
+# Both have the same four methods. `SpotLamp` has the equations of the lamp.
 
 
 FAR = 1e9
 
 
 class DistantLight(NamedTuple):
-    """The same from everywhere."""
+    """A light in the same direction from everywhere."""
 
     direction: Float[Tensor, "3"]
 
     def toward(self, points: Float[Tensor, "R 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "R 3"]:
-        """Unit vectors from points [m] toward the light, in the frame into which `rotation` leads from the world."""
+        """Return unit vectors from points [m] toward the light; `rotation` leads from the world into their frame."""
         return (rotation @ self.direction).expand_as(points)
 
     def distance(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
-        """From points to the light [m]; what lies beyond it casts no shadow."""
+        """Return distances from points to the light [m]; what lies beyond it casts no shadow."""
         return torch.full_like(points[:, 0], FAR)
 
     def gain(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 1"]:
-        """Share of the diffuse light that arrives at points where nothing shades them."""
+        """Return the share of the diffuse light that arrives at points where nothing shades them."""
         return torch.ones_like(points[:, :1])
 
     def on_table(self, table: TableField, points: Float[Tensor, "R 3"]) -> Float[Tensor, "#R 3"]:
-        """Direct light of three colours on a white table at points of it where nothing shades them."""
+        """Return direct light of three colours on a white table at points of it where nothing shades them."""
         return torch.as_tensor(table.direct(self.direction.cpu().double().numpy()[None])).to(points)
 
 
@@ -101,59 +73,27 @@ class NearLight(NamedTuple):
     outer: float
 
     def toward(self, points: Float[Tensor, "R 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "R 3"]:
-        """As of a distant light."""
+        """Return the same as of a distant light."""
         return normalize(self.position - points, dim=-1) @ rotation.T
 
     def distance(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
-        """As of a distant light."""
+        """Return the same as of a distant light."""
         return torch.linalg.norm(self.position - points, dim=-1)
 
     def gain(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 1"]:
-        """As of a distant light: the cone's share times the falloff, (d0 / r)^2."""
+        """Return the same as of a distant light: the cone's share times the falloff, (d0 / r)^2."""
         angle = torch.arccos((normalize(points - self.position, dim=-1) @ self.axis).clamp(-1, 1))
         s = ((self.outer - angle) / max(self.outer - self.inner, MIN_PENUMBRA_RAD)).clamp(0, 1)
         falloff = (self.position @ self.position) / self.distance(points) ** 2
         return (s * s * (3 - 2 * s) * falloff)[:, None]
 
     def on_table(self, table: TableField, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-        """As of a distant light."""
+        """Return the same as of a distant light."""
         directions = normalize(self.position - points, dim=-1)
         return torch.as_tensor(table.direct(directions.cpu().double().numpy())).to(points) * self.gain(points)
 
 
-def near_light(spot: SpotLamp, tensor: Callable[[object], Tensor]) -> NearLight:
-    """A lamp as tensors, which `tensor` makes of arrays."""
-    return NearLight(tensor(spot.position), tensor(spot.axis), *spot.cone_rad)
-
-
-def alphas_from_thickness(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
-    """Opacity of each sample, alpha_i = 1 - exp(-tau_i); exact for thin samples as well."""
-    return -torch.expm1(-taus)
-
-
-def transmittance(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
-    """Share of the light that reaches each sample, T_i = exp(-sum of tau_j over j < i); samples by distance."""
-    return torch.exp(-(torch.cumsum(taus, dim=1) - taus))
-
-
-def final_transmittance(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays"]:
-    """Share of the light that passes all samples, T_end."""
-    return torch.exp(-taus.sum(dim=1))
-
-
-def render_weights(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays samples"]:
-    """Weight of each sample, w_i = T_i alpha_i; the weights of a ray and T_end sum to 1."""
-    return transmittance(taus) * alphas_from_thickness(taus)
-
-
-def accumulate_along_rays(
-    weights: Float[Tensor, "rays samples"], values: Float[Tensor, "rays samples channels"]
-) -> Float[Tensor, "rays channels"]:
-    """Weighted sum of the samples' values: colours give the ray's radiance, distances its expected depth."""
-    return (weights[..., None] * values).sum(dim=1)
-
-
-# Fields of known shapes: the pusher, and slabs for tests. They need no training.
+# Fields of known shapes, which need no training: the pusher, and other solids.
 
 
 _PUSHER_VOXEL_M = 0.0025
@@ -162,7 +102,7 @@ _SOLID_G = 10.0
 
 
 def pusher_field(hidden: int) -> KiloOSF:
-    """The pusher, around its centre: a matte cylinder of known colour."""
+    """Return the pusher, around its centre: a matte cylinder of known colour."""
     half = PUSHER_HEIGHT_M / 2
 
     def depth(x: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s"]:
@@ -188,7 +128,7 @@ def solid_field(
     g: float = _SOLID_G,
     edge_g: float = _EDGE_G,
 ) -> KiloOSF:
-    """A matte solid under the world's lamp.
+    """Make a matte solid under the world's lamp.
 
     Args:
         depth: how deep points lie inside the solid, negative outside [m].
@@ -226,7 +166,7 @@ class _Placed(NamedTuple):
 
 
 class _Samples(NamedTuple):
-    """Samples of one object along R rays; unused slots have no optical thickness."""
+    """The samples of one object along R rays; unused slots have no optical thickness."""
 
     t_mids: Float[Tensor, "R S"]  # distances of the samples [m]
     taus: Float[Tensor, "R S"]  # optical thickness
@@ -244,7 +184,7 @@ def render_reference(
     quality: Quality = EXACT,
     outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
 ) -> Rendered:
-    """One scene from one camera.
+    """Render one scene from one camera.
 
     Args:
         fields: by name.
@@ -269,7 +209,7 @@ def render_on_device(
     fields: Mapping[str, KiloOSF], table: TableField | None, batch: SceneBatch, cameras: Sequence[Camera], device: str,
     quality: Quality, outputs: frozenset[str] | set[str], only: Bool[np.ndarray, "V h w"] | None = None,
 ) -> Rendered:  # fmt: skip
-    """A batch in single precision on a PyTorch device.
+    """Render a batch in single precision on a PyTorch device.
 
     Args:
         fields: by name.
@@ -294,14 +234,12 @@ def render_on_device(
 
 @torch.no_grad()
 def _render_batch(fields, table, batch, cameras, device, dtype, quality, outputs) -> Rendered:  # noqa: ANN001
-    queries = {name: KiloQuery(fields[name], dtype=dtype, device=device) for name in dict.fromkeys(batch.names)}
-    extents = {name: _extent(fields[name]) for name in queries}
-    pusher = None  # not among the named ones: an object may have any name
+    names, solids = [*batch.names], {name: fields[name] for name in batch.names}
     if batch.pusher is not None:
-        solid = pusher_field(next(iter(fields.values())).hidden if fields else 1)
-        pusher = KiloQuery(solid, dtype=dtype, device=device), _extent(solid), batch.pusher
-    count = len(batch.names)
-    size = cameras[0].height, cameras[0].width
+        names.append(None)  # not "pusher": an object may have any name
+        solids[None] = pusher_field(next(iter(fields.values())).hidden if fields else 1)
+    queries = {name: KiloQuery(field, dtype=dtype, device=device) for name, field in solids.items()}
+    size, count = (cameras[0].height, cameras[0].width), len(batch.names)
     rgb = np.zeros((len(batch.lights), len(cameras), *size, 3), np.float32)
     opacity = np.zeros((len(batch.lights), len(cameras), count, *size), np.float32)
     depth = np.zeros(rgb.shape[:-1], np.float32)
@@ -309,35 +247,30 @@ def _render_batch(fields, table, batch, cameras, device, dtype, quality, outputs
     def tensor(array: object) -> Tensor:
         return torch.as_tensor(np.array(array), dtype=dtype, device=device)
 
-    for b, direction in enumerate(batch.lights):
-        light = DistantLight(tensor(direction)) if batch.spots is None else near_light(batch.spots[b], tensor)
-        rotations = np.swapaxes(quaternion_to_matrix(batch.quaternions[b]), -1, -2)
-        placed = [_Placed(queries[n], tensor(extents[n]), tensor(R), tensor(p))
-                  for n, R, p in zip(batch.names, rotations, batch.positions[b], strict=True)]  # fmt: skip
-        if pusher is not None:
-            query, extent, centres = pusher
-            placed.append(_Placed(query, tensor(extent), tensor(np.eye(3)), tensor(centres[b])))
+    for b, (rotations, positions) in enumerate(zip(*poses_of(batch), strict=True)):
+        if batch.spots is None:
+            light = DistantLight(tensor(batch.lights[b]))
+        else:
+            spot = batch.spots[b]
+            light = NearLight(tensor(spot.position), tensor(spot.axis), *spot.cone_rad)
+        placed = [_Placed(queries[name], tensor(_extent(solids[name])), tensor(R), tensor(p))
+                  for name, R, p in zip(names, rotations, positions, strict=True)]  # fmt: skip
         for v, camera in enumerate(cameras):
             colours, shares, depths = _render_image(placed, table, light, camera, quality, tensor)
             rgb[b, v], depth[b, v] = colours.cpu().numpy(), depths.cpu().numpy()
             opacity[b, v] = shares[:count].cpu().numpy()
-    return Rendered(
-        rgb,
-        opacity if "opacity" in outputs else None,
-        opacity >= MASK_OPACITY if "masks" in outputs else None,
-        depth if "depth" in outputs else None,
-    )
+    return Rendered.of(rgb, opacity, depth, outputs)
 
 
 def _extent(field: KiloOSF) -> np.ndarray:
-    """The occupied part, one voxel wider: density is interpolated."""
+    """Return the occupied part of a field, one voxel wider: density is interpolated."""
     low, high = field.extent
     box = field.box
     return np.stack([np.maximum(low - field.voxel, box[0]), np.minimum(high + field.voxel, box[1])])
 
 
 def _render_image(placed, table, light, camera, quality, tensor):  # noqa: ANN001, ANN202
-    """Colours (h, w, 3), shares of the objects (N, h, w) and z-depths (h, w) of one image."""
+    """Return colours (h, w, 3), shares of the objects (N, h, w) and z-depths (h, w) of one image."""
     s = quality.samples_per_side
     height, width = camera.height, camera.width
     numbers = tensor(camera_numbers(camera))
@@ -346,12 +279,12 @@ def _render_image(placed, table, light, camera, quality, tensor):  # noqa: ANN00
     columns = torch.arange(width * s, device=numbers.device, dtype=numbers.dtype) + 0.5
     v, u = torch.meshgrid(rows / s, columns / s, indexing="ij")
     places = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
-    rays_d = torch.nn.functional.normalize(places @ numbers[3:].view(3, 3).T, dim=-1)
+    rays_d = normalize(places @ numbers[3:].view(3, 3).T, dim=-1)
     parts = [_render_rays(placed, table, light, numbers[:3], d, quality, tensor) for d in rays_d.split(_RAYS_AT_ONCE)]
     colour, shares, distance, weight = (torch.cat(part) for part in zip(*parts, strict=True))
 
     def pixels(values: Tensor) -> Tensor:
-        """Means over the rays of each pixel."""
+        """Return means over the rays of each pixel."""
         return values.view(height, s, width, s, -1).mean(dim=(1, 3))
 
     whole = pixels(weight[:, None])[..., 0]
@@ -361,7 +294,7 @@ def _render_image(placed, table, light, camera, quality, tensor):  # noqa: ANN00
 
 
 def _render_rays(placed, table, light, rays_o, rays_d, quality, tensor):  # noqa: ANN001, ANN202
-    """Radiance (R, 3), objects' weights (R, N), weighted distance (R) and total weight (R) of rays from one point."""
+    """Return radiance (R, 3), objects' weights (R, N), weighted distance (R) and weight (R) of rays from one point."""
     count = len(rays_d)
     table_t = _intersect_table(table, rays_o, rays_d)
     samples = [_sample_object(placed, n, light, rays_o, rays_d, table_t, quality) for n in range(len(placed))]
@@ -392,7 +325,7 @@ def _render_rays(placed, table, light, rays_o, rays_d, quality, tensor):  # noqa
 
 
 def _intersect_table(table: TableField | None, rays_o: Tensor, rays_d: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
-    """Distance to the table [m]; very far for rays that miss it."""
+    """Return the distance to the table [m]; very far for rays that miss it."""
     far = torch.full_like(rays_d[:, 0], FAR)
     if table is None or rays_o[2] <= 0:
         return far
@@ -405,7 +338,7 @@ def _intersect_table(table: TableField | None, rays_o: Tensor, rays_d: Float[Ten
 def _march(
     placed: _Placed, rays_o: Float[Tensor, "R 3"], rays_d: Float[Tensor, "R 3"], far: Float[Tensor, "R"], step: float
 ) -> Iterator[tuple[Float[Tensor, "R"], Float[Tensor, "R"]]]:
-    """Ray marching within an object's extent: yields distances of the next samples, and which rays have one there."""
+    """March rays through an object's extent: yield distances of the next samples, and which rays have one there."""
     safe = torch.where(rays_d.abs() < 1e-9, 1e-9, rays_d)
     a, b = (placed.extent[0] - rays_o) / safe, (placed.extent[1] - rays_o) / safe
     near = torch.minimum(a, b).amax(dim=-1).clamp(min=0)
@@ -423,7 +356,7 @@ def _to_object_frame(placed: _Placed, points: Float[Tensor, "R 3"]) -> Float[Ten
 
 
 def _sample_object(placed, n, light, rays_o, rays_d, table_t, quality) -> _Samples:  # noqa: ANN001
-    """All samples of object n along each ray: tau_i = sigma_i delta, radiance from the OSF (paper eqs. 1 and 2)."""
+    """Sample object n along each ray: tau_i = sigma_i delta, radiance from the OSF (paper eqs. 1 and 2)."""
     own = placed[n]
     step = quality.step_voxels * own.query.voxel
     local_o = _to_object_frame(own, rays_o[None]).expand_as(rays_d)
@@ -451,7 +384,7 @@ def _sample_object(placed, n, light, rays_o, rays_d, table_t, quality) -> _Sampl
 
 
 def _light_transmittance(placed, skip, points, light, quality) -> Float[Tensor, "R"]:  # noqa: ANN001
-    """Transmittance from points in the world toward the light through all objects but one: their shadow."""
+    """Return the transmittance from points in the world toward the light through all objects but one: their shadow."""
     total = points.new_zeros(len(points))
     for n, other in enumerate(placed):
         if n == skip or not len(points):
@@ -469,4 +402,4 @@ def _light_transmittance(placed, skip, points, light, quality) -> Float[Tensor, 
 def _albedo(table: TableField, points: Float[Tensor, "R 3"], tensor) -> Float[Tensor, "R 3"]:  # noqa: ANN001
     grid = tensor(table.albedo).permute(2, 1, 0)[None]  # rows of an image run along y
     places = points[None, None, :, :2] / table.half_side
-    return torch.nn.functional.grid_sample(grid, places, align_corners=True)[0, :, 0].T
+    return grid_sample(grid, places, align_corners=True)[0, :, 0].T

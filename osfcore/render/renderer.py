@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from osfcore.errors import InvalidInput
+from osfcore.fields.devices import pick_device
 from osfcore.fields.kiloosf import MOST_HIDDEN, KiloOSF
 from osfcore.fields.rays import ONE_AT_A_TIME
 from osfcore.fields.table import TableField
@@ -17,23 +18,14 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import MIN_PENUMBRA_RAD, SpotLamp
 from osfcore.geometry.poses import quaternion_to_matrix
 from osfcore.render.kernels import BAND_ROWS, GONE, MOVES, NO_OUTLINE, STILL, render_batch
-from osfcore.render.reference import pusher_field
-from osfcore.render.types import (
-    EXACT,
-    MASK_OPACITY,
-    Quality,
-    Rendered,
-    SceneBatch,
-    camera_numbers,
-    check_request,
-    poses_of,
-)
+from osfcore.render.reference import pusher_field, render_on_device
+from osfcore.render.types import EXACT, Quality, Rendered, SceneBatch, camera_numbers, check_request, poses_of
 
-# Fields laid end to end in flat arrays, as compiled code likes them.
+# Fields laid end to end in flat arrays, as compiled code needs them.
 
 
 class Packed(NamedTuple):
-    """N fields. `starts` says where each one begins in the flat arrays.
+    """N fields. `starts` holds where each one begins in the flat arrays.
 
     Attributes:
         density: g on all corners.
@@ -77,17 +69,12 @@ def pack(fields: Sequence[KiloOSF]) -> Packed:
         raise InvalidInput("widths of the fields' networks", sorted(widths), "the same for all fields of a scene")
     if max(widths) > MOST_HIDDEN:
         raise InvalidInput("width of the fields' networks", max(widths), f"at most {MOST_HIDDEN}")
-    flat = {name: [getattr(f, name).reshape(-1) for f in fields] for name in ("density", "index", "macro", "cells")}
-    rows = [f.rows for f in fields]
-    networks = [f.networks for f in fields]
-    counts = [[len(parts[i]) for parts in (flat["density"], rows, flat["macro"], flat["cells"], networks)]
-              for i in range(len(fields))]  # fmt: skip
+    counts = [[f.density.size, len(f.rows), f.macro.size, f.cells.size, len(f.networks)] for f in fields]
     starts = np.zeros((len(fields), 5), np.int64)
     starts[1:] = np.cumsum(counts, axis=0)[:-1]
+    flat = ("density", "index", "rows", "macro", "cells", "networks")
     return Packed(
-        **{name: np.concatenate(parts) for name, parts in flat.items()},
-        rows=np.concatenate(rows).reshape(-1),
-        networks=np.concatenate(networks).reshape(-1),
+        **{name: np.concatenate([getattr(f, name).reshape(-1) for f in fields]) for name in flat},
         starts=starts,
         shapes=np.array([[*f.index.shape, *f.macro.shape, *f.cells.shape] for f in fields], np.int64),
         scales=np.array([[*f.origin, f.voxel] for f in fields], np.float32),
@@ -99,12 +86,12 @@ def pack(fields: Sequence[KiloOSF]) -> Packed:
 
 
 def _reach(field: KiloOSF) -> np.ndarray:
-    """The occupied part and one voxel more: between an occupied corner and an empty one there is density too."""
+    """Return the occupied part and one voxel more: between an occupied corner and an empty one there is density too."""
     low, high = field.extent
     return np.stack([low - field.voxel, high + field.voxel])
 
 
-# Near lamps for the compiled renderer: where they are in every object's coordinates, and where their shadows fall.
+# Near lamps for the compiled renderer: their places in every object's coordinates, and where their shadows fall.
 
 
 _HIGHEST = 0.98  # of a lamp's height: what reaches higher may cast its shadow anywhere
@@ -129,6 +116,10 @@ class Lamps(NamedTuple):
     w2: np.ndarray
     b2: np.ndarray
 
+    def of(self, chosen: Int[np.ndarray, "L"]) -> Lamps:
+        """Return the lamps of some of the scenes."""
+        return Lamps(self.position[chosen], self.axis[chosen], self.cone[chosen], *self[3:])
+
 
 def place_lamps(
     spots: Sequence[SpotLamp],
@@ -138,7 +129,7 @@ def place_lamps(
     positions: Float[np.ndarray, "B N 3"],
     table: TableField | None,
 ) -> Lamps:
-    """The lamps of B scenes, worked out in double precision.
+    """Work out the lamps of B scenes in double precision.
 
     Args:
         spots: one for each scene.
@@ -166,18 +157,8 @@ def place_lamps(
     return Lamps(*(np.array(array, np.float32, order="C") for array in arrays))  # any other layout is compiled anew
 
 
-def lamps_of(lamps: Lamps, chosen: Int[np.ndarray, "L"]) -> Lamps:
-    """The lamps of some of the scenes."""
-    return Lamps(lamps.position[chosen], lamps.axis[chosen], lamps.cone[chosen], *lamps[3:])
-
-
-def numbers_of_lamps(spots: Sequence[SpotLamp]) -> Float[np.ndarray, "B 8"]:
-    """All that tells one lamp from another, a row for each."""
-    return np.array([(*spot.position, *spot.aim, spot.inner_deg, spot.outer_deg) for spot in spots])
-
-
 def below_lamps(points: Float[np.ndarray, "B N 8 3"], spots: Sequence[SpotLamp]) -> Float[np.ndarray, "B N 8 3"]:
-    """Where lamps drop points onto the plane z = 0; NaN where a point is about as high as the lamp, or higher."""
+    """Drop points from lamps onto the plane z = 0; NaN where a point is about as high as the lamp, or higher."""
     lamps = np.array([spot.position for spot in spots])[:, None, None]
     height = lamps[..., 2:]
     is_below = points[..., 2:] < _HIGHEST * height
@@ -241,7 +222,7 @@ class Scene(NamedTuple):
     reach: np.ndarray
 
     def of(self, chosen: Int[np.ndarray, "L"], part: Int[np.ndarray, "L N"]) -> Scene:
-        """Some of the scenes, with other parts."""
+        """Return some of the scenes, with other parts."""
         return Scene._make([*(array[chosen] for array in self[:-1]), self.reach])._replace(part=part)
 
 
@@ -271,63 +252,6 @@ class Rules(NamedTuple):
     samples: int
 
 
-def launch(  # noqa: D417
-    pack: Packed,
-    numbers: Int[np.ndarray, "N"],
-    table: TableField | None,
-    batch: SceneBatch,
-    cameras: Sequence[Camera],
-    size: tuple[int, int],
-    quality: Quality,
-    outputs: frozenset[str] | set[str],
-    only: Bool[np.ndarray, "V h w"] | None,
-) -> Rendered:
-    """Render a batch on the CPU.
-
-    Args:
-        pack, numbers, size: fields, which of them each object has (the pusher's last), and h, w of the images [px].
-        table, batch, cameras, quality, outputs, only: as in `SceneRenderer` and its `render`.
-    """
-    rotations, positions = poses_of(batch)
-    views = np.array([camera_numbers(camera) for camera in cameras])
-    lamps = None if batch.spots is None else place_lamps(batch.spots, pack, numbers, rotations, positions, table)
-    scene = _scene(pack, numbers, table, batch, cameras, rotations, positions, views)
-    mask = np.zeros((0, 0, 0), np.uint8) if only is None else np.ascontiguousarray(only).view(np.uint8)
-    shape = len(cameras), *size
-    lenses = np.array(views, np.float32, order="C")
-
-    def draw(scene: Scene, lamps: Lamps | None, base: Base) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        images = _blank(len(scene.eye), shape, len(batch.names), outputs)
-        render_batch(pack, plain_table(table), numbers, scene, lamps, lenses, base, _rules(quality), mask,
-                     _stride(images[0]), *images)  # fmt: skip
-        return images
-
-    still, chosen, of = _shared(batch, rotations, positions, has_table=table is not None)
-    base = Base(np.full(len(chosen), -1), *_blank(0, shape, len(batch.names), outputs))
-    with ONE_AT_A_TIME:
-        if len(chosen):
-            seen = scene.of(chosen, np.where(still[chosen], MOVES, GONE))
-            base = Base(of, *draw(seen, None if lamps is None else lamps_of(lamps, chosen), base))
-        scene = scene._replace(part=np.where(still & (of >= 0)[:, None], STILL, MOVES))
-        rgb, opacity, distance = draw(scene, lamps, base._replace(of=of))
-    return Rendered(
-        rgb,
-        opacity if "opacity" in outputs else None,
-        opacity >= MASK_OPACITY if "masks" in outputs else None,
-        z_depth(distance, cameras) if "depth" in outputs else None,
-    )
-
-
-def _blank(
-    scenes: int, shape: tuple[int, ...], count: int, outputs: frozenset[str] | set[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Memory for colours, opacity of so many objects and distance; empty where not asked for."""
-    views, *size = shape
-    opacity = np.zeros((scenes, views, count, *size) if {"opacity", "masks"} & set(outputs) else (0,) * 5, np.float32)
-    distance = np.empty((scenes, *shape) if "depth" in outputs else (0,) * 4, np.float32)
-    return np.empty((scenes, *shape, 3), np.float32), opacity, distance
-
-
 def _shared(
     batch: SceneBatch,
     rotations: Float[np.ndarray, "B N 3 3"],
@@ -335,7 +259,7 @@ def _shared(
     *,
     has_table: bool,
 ) -> tuple[Bool[np.ndarray, "B N"], Int[np.ndarray, "L"], Int[np.ndarray, "B"]]:
-    """What scenes have in common, so that it is drawn once: planning and derivatives move one object of many.
+    """Find what scenes have in common, so that it is drawn once: planning and derivatives move one object of many.
 
     Returns:
         For each scene, objects whose pose is the commonest of that object; L scenes, one for each set of two or more
@@ -350,7 +274,9 @@ def _shared(
         for n in range(count):
             _, which, many = np.unique(poses[:, n], axis=0, return_inverse=True, return_counts=True)
             still[:, n] = (which == many.argmax()).reshape(-1) if many.max() > 1 else False
-    lights = batch.lights if batch.spots is None else numbers_of_lamps(batch.spots)
+    lights = batch.lights
+    if batch.spots is not None:
+        lights = np.array([(*spot.position, *spot.aim, spot.inner_deg, spot.outer_deg) for spot in batch.spots])
     rows = np.concatenate([lights, still], axis=1)
     _, first, which, many = np.unique(rows, axis=0, return_index=True, return_inverse=True, return_counts=True)
     number = np.where(many > 1, np.cumsum(many > 1) - 1, -1)
@@ -358,7 +284,7 @@ def _shared(
 
 
 def _stride(images: Float32[np.ndarray, "B V h w 3"]) -> int:
-    """A number coprime to the number of bands, about the golden section of it, so that multiples spread evenly."""
+    """Return a number coprime to that of the bands, near its golden section, so that multiples spread evenly."""
     bands = images.shape[0] * images.shape[1] * -(-images.shape[2] // BAND_ROWS)
     return next(s for s in range(max(round(0.618 * bands), 1), 2 * bands + 2) if math.gcd(s, bands) == 1)
 
@@ -373,7 +299,7 @@ def _scene(
     positions: Float[np.ndarray, "B N 3"],
     lenses: Float[np.ndarray, "V 12"],
 ) -> Scene:
-    """Everything in voxel coordinates, worked out in double precision, and on the screens; all objects move."""
+    """Work out where everything is, in double precision: in voxel coordinates and on the screens; all objects move."""
     scales = pack.scales[numbers].astype(float)
     origin, voxel = scales[:, :3], scales[:, 3:]
     into = rotations / voxel[..., None]  # from the world
@@ -383,9 +309,8 @@ def _scene(
     lit = np.einsum("bnij,bj->bni", into, batch.lights)
     # From object n: x_world = R_n^T (voxel_n * x + origin_n) + position_n; the world comes as it is.
     scenes, count = positions.shape[:2]
-    linear = np.concatenate(
-        [np.swapaxes(rotations, -1, -2) * voxel[..., None], np.tile(np.eye(3), (scenes, 1, 1, 1))], 1
-    )
+    world = np.tile(np.eye(3), (scenes, 1, 1, 1))
+    linear = np.concatenate([np.swapaxes(rotations, -1, -2) * voxel[..., None], world], axis=1)
     shift = np.einsum("bnji,nj->bni", rotations, origin) + positions
     shift = np.concatenate([shift, np.zeros((scenes, 1, 3))], axis=1)
     between = np.empty((scenes, count + 1, count, 3, 4))
@@ -415,53 +340,37 @@ def _outlines(
     *,
     has_table: bool,
 ) -> list[np.ndarray]:
-    """Boxes and outlines of `Scene`: of objects, of shadows, of both with what is between."""
-    corners = _corners_world(extents, rotations, positions)
+    """Return the boxes and outlines of `Scene`: of objects, of shadows, of both with what is between."""
+    choice = np.array(list(np.ndindex(2, 2, 2)), bool)
+    local = np.where(choice, extents[:, None, 3:], extents[:, None, :3])  # corners of the objects' boxes [m]
+    corners = np.einsum("bnji,ncj->bnci", rotations, local) + positions[:, :, None]
     if not has_table:
         box, outline = _on_screen(corners, cameras)
         return [box, outline, np.zeros_like(box), np.zeros_like(outline), box, np.concatenate([outline] * 2, axis=3)]
     dropped = _on_table(corners, batch.lights) if batch.spots is None else below_lamps(corners, batch.spots)
     boxes, outlines = _on_screen(np.concatenate([corners, dropped], axis=1), cameras)
-    (box, shadow_box), (outline, shadow) = _halves(boxes), _halves(outlines)
-    swept_box, swept = _on_screen(np.concatenate([corners, dropped], axis=2), cameras)
-    return [box, outline, shadow_box, shadow, swept_box, swept]
-
-
-def _rules(quality: Quality) -> Rules:
-    f = np.float32
-    return Rules(f(quality.step_voxels), f(quality.min_weight), f(quality.stop), f(-np.log(quality.stop)),
-                 quality.one_shadow, f(quality.shadow_voxels), quality.samples_per_side)  # fmt: skip
-
-
-def _corners_world(
-    extents: Float[np.ndarray, "N 6"], rotations: Float[np.ndarray, "B N 3 3"], positions: Float[np.ndarray, "B N 3"]
-) -> Float[np.ndarray, "B N 8 3"]:
-    """The corners of the objects' boxes [m]."""
-    choice = np.array(list(np.ndindex(2, 2, 2)), bool)
-    corners = np.where(choice, extents[:, None, 3:], extents[:, None, :3])
-    return np.einsum("bnji,ncj->bnci", rotations, corners) + positions[:, :, None]
+    count = len(extents)
+    halves = [
+        np.ascontiguousarray(a[:, :, part]) for part in (slice(count), slice(count, None)) for a in (boxes, outlines)
+    ]
+    return [*halves, *_on_screen(np.concatenate([corners, dropped], axis=2), cameras)]
 
 
 def _on_screen(
     points: Float[np.ndarray, "B N P 3"], cameras: Sequence[Camera]
 ) -> tuple[Int[np.ndarray, "B V N 4"], Float32[np.ndarray, "B V N P 2"]]:
-    """Boxes of pixels and outlines of points, from every camera."""
+    """Return boxes of pixels and outlines of points, from every camera."""
     boxes, outlines = zip(*(screen_boxes(points, camera) for camera in cameras), strict=True)
     return np.stack(boxes, axis=1), np.stack(outlines, axis=1)
-
-
-def _halves(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The first and the second half along the third axis, each in one piece."""
-    count = array.shape[2] // 2
-    return np.ascontiguousarray(array[:, :, :count]), np.ascontiguousarray(array[:, :, count:])
 
 
 def screen_boxes(
     points: Float[np.ndarray, "B N P 3"], camera: Camera
 ) -> tuple[Int[np.ndarray, "B N 4"], Float32[np.ndarray, "B N P 2"]]:
-    """The pixels that hold the projections of bodies' points: columns from, to, rows from, to (not included).
+    """Return boxes of pixels that hold the projections of bodies' points, and the projections themselves [px].
 
-    And the projections themselves [px]; `NO_OUTLINE` where a body reaches behind the camera.
+    A box is columns from, to, rows from, to (not included). The projections are `NO_OUTLINE` where a body reaches
+    behind the camera.
     """
     pose = camera.T_world_camera
     local = (points - pose.position) @ quaternion_to_matrix(pose.quaternion)
@@ -481,7 +390,7 @@ def screen_boxes(
 
 
 def _on_table(points: Float[np.ndarray, "B N 8 3"], lights: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B N 8 3"]:
-    """Where the light drops points onto the plane z = 0. Lights below it drop nothing."""
+    """Drop points along the light onto the plane z = 0; lights below it count as just above it."""
     elevation = np.maximum(lights[:, 2], 1e-3)[:, None, None, None]
     dropped = points - lights[:, None, None] * points[..., 2:] / elevation  # points below it rise: none is left out
     dropped[..., 2] = 0
@@ -489,7 +398,7 @@ def _on_table(points: Float[np.ndarray, "B N 8 3"], lights: Float[np.ndarray, "B
 
 
 def plain_table(table: TableField | None) -> Table:
-    """A table for compiled code."""
+    """Prepare a table for compiled code."""
     if table is None:
         nothing = np.zeros(3, np.float32)
         return Table(False, np.float32(1), np.zeros((2, 2, 3), np.float32), nothing, nothing)
@@ -497,16 +406,13 @@ def plain_table(table: TableField | None) -> Table:
 
 
 def z_depth(distance: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Distances along rays as distances along the cameras' z axes."""
+    """Turn distances along rays into distances along the cameras' z axes."""
     result = np.empty_like(distance)
     for view, camera in enumerate(cameras):
         rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
         pixels = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera.intrinsics).T
         result[:, view] = distance[:, view] / np.linalg.norm(pixels, axis=-1)
     return result
-
-
-# The fast path: whole batches of scenes from several cameras in one call.
 
 
 _MOST_PACKS = 8
@@ -533,11 +439,7 @@ class SceneRenderer:
         """
         self._fields = dict(fields)
         self._table = table
-        self._device = device
-        if device != "cpu":
-            from osfcore.fields.devices import pick_device
-
-            self._device = pick_device(device).type
+        self._device = "cpu" if device == "cpu" else pick_device(device).type
         self._packs: dict[tuple[tuple[str, ...], bool], tuple[Packed, np.ndarray]] = {}
 
     @property
@@ -554,7 +456,7 @@ class SceneRenderer:
         outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
         only: Bool[np.ndarray, "V h w"] | None = None,
     ) -> Rendered:
-        """Images of every scene of a batch from every camera.
+        """Render every scene of a batch from every camera.
 
         Args:
             batch: B scenes.
@@ -571,14 +473,43 @@ class SceneRenderer:
         if only is not None and only.shape != (len(cameras), *size):
             raise InvalidInput("shape of the pixels to look at", only.shape, f"{(len(cameras), *size)}")
         if self._device != "cpu":
-            from osfcore.render.reference import render_on_device  # torch: seconds, and only a GPU needs it
-
             return render_on_device(self._fields, self._table, batch, cameras, self._device, quality, outputs, only)
-        pack, numbers = self._packed(batch)
-        return launch(pack, numbers, self._table, batch, cameras, size, quality, outputs, only)
+        table, (pack, numbers) = self._table, self._packed(batch)
+        rotations, positions = poses_of(batch)
+        views = np.array([camera_numbers(camera) for camera in cameras])
+        lamps = None if batch.spots is None else place_lamps(batch.spots, pack, numbers, rotations, positions, table)
+        scene = _scene(pack, numbers, table, batch, cameras, rotations, positions, views)
+        mask = np.zeros((0, 0, 0), np.uint8) if only is None else np.ascontiguousarray(only).view(np.uint8)
+        lenses = np.array(views, np.float32, order="C")
+        f = np.float32
+        rules = Rules(f(quality.step_voxels), f(quality.min_weight), f(quality.stop), f(-np.log(quality.stop)),
+                      quality.one_shadow, f(quality.shadow_voxels), quality.samples_per_side)  # fmt: skip
+
+        def blank(scenes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            """Allocate colours, opacity and distance; empty where not asked for."""
+            shape, per_object = (scenes, len(cameras), *size), (scenes, len(cameras), len(batch.names), *size)
+            opacity = np.zeros(per_object if {"opacity", "masks"} & set(outputs) else (0,) * 5, f)
+            return np.empty((*shape, 3), f), opacity, np.empty(shape if "depth" in outputs else (0,) * 4, f)
+
+        def draw(scene: Scene, lamps: Lamps | None, base: Base) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            images = blank(len(scene.eye))
+            render_batch(pack, plain_table(table), numbers, scene, lamps, lenses, base, rules, mask,
+                         _stride(images[0]), *images)  # fmt: skip
+            return images
+
+        still, chosen, of = _shared(batch, rotations, positions, has_table=table is not None)
+        base = Base(np.full(len(chosen), -1), *blank(0))
+        with ONE_AT_A_TIME:
+            if len(chosen):
+                seen = scene.of(chosen, np.where(still[chosen], MOVES, GONE))
+                base = Base(of, *draw(seen, None if lamps is None else lamps.of(chosen), base))
+            scene = scene._replace(part=np.where(still & (of >= 0)[:, None], STILL, MOVES))
+            rgb, opacity, distance = draw(scene, lamps, base._replace(of=of))
+        depth = z_depth(distance, cameras) if "depth" in outputs else distance
+        return Rendered.of(rgb, opacity, depth, outputs)
 
     def _packed(self, batch: SceneBatch) -> tuple[Packed, np.ndarray]:
-        """The batch's fields, each packed once, and which of them each object has."""
+        """Return the batch's fields, each packed once, and which of them each object has."""
         key = (batch.names, batch.pusher is not None)
         packed = self._packs.get(key)
         if packed is None:
@@ -588,8 +519,7 @@ class SceneRenderer:
             fields = [self._fields[name] for name in names]
             numbers = [names.index(name) for name in batch.names]
             if batch.pusher is not None or not fields:
-                hidden = fields[0].hidden if fields else 1
-                fields.append(pusher_field(hidden))
+                fields.append(pusher_field(fields[0].hidden if fields else 1))
             if batch.pusher is not None:
                 numbers.append(len(fields) - 1)
             packed = pack(fields), np.array(numbers, np.int64)

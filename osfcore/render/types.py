@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import SpotLamp
-from osfcore.geometry.poses import QUATERNION_NORM_TOLERANCE, Pose, quaternion_to_matrix
+from osfcore.geometry.poses import QUATERNION_NORM_TOLERANCE, quaternion_to_matrix
 from osfcore.geometry.states import SceneState
 
 OUTPUTS = frozenset({"rgb", "opacity", "masks", "depth"})
@@ -92,7 +92,7 @@ class SceneBatch:
 
     @staticmethod
     def of(state: SceneState, spot: SpotLamp | None = None) -> SceneBatch:
-        """One scene as a batch, under a near lamp in the place of its light if one is given."""
+        """Make a batch of one scene, under a near lamp in the place of its light if one is given."""
         pusher = None if state.pusher is None else state.pusher[None]
         light = state.light if spot is None else spot.distant
         return SceneBatch(
@@ -117,6 +117,16 @@ class Rendered:
     masks: Bool[np.ndarray, "B V N h w"] | None = None
     depth: Float32[np.ndarray, "B V h w"] | None = None
 
+    @staticmethod
+    def of(rgb: np.ndarray, opacity: np.ndarray, depth: np.ndarray, outputs: Collection[str]) -> Rendered:
+        """Keep of everything that was drawn what was asked for."""
+        return Rendered(
+            rgb,
+            opacity if "opacity" in outputs else None,
+            opacity >= MASK_OPACITY if "masks" in outputs else None,
+            depth if "depth" in outputs else None,
+        )
+
 
 class Renderer(Protocol):
     """What draws scenes: `osfcore.render.renderer.SceneRenderer`, or the paper's."""
@@ -135,14 +145,14 @@ class Renderer(Protocol):
         outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
         only: Bool[np.ndarray, "V h w"] | None = None,
     ) -> Rendered:
-        """Images of every scene of a batch from every camera."""
+        """Render every scene of a batch from every camera."""
         ...
 
 
 def check_request(
     fields: Collection[str], batch: SceneBatch, cameras: Sequence[Camera], outputs: frozenset[str] | set[str]
 ) -> tuple[int, int]:
-    """Height and width of the images [px], after everything asked for was found possible.
+    """Return height and width of the images [px], once everything asked for is found possible.
 
     Args:
         fields: names of those there are.
@@ -167,7 +177,7 @@ def check_request(
 
 
 def poses_of(batch: SceneBatch) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations from the world into each object's frame (B, N, 3, 3) and positions (B, N, 3), the pusher last."""
+    """Return rotations from the world into objects' frames (B, N, 3, 3) and positions (B, N, 3), the pusher last."""
     rotations = np.swapaxes(quaternion_to_matrix(batch.quaternions), -1, -2)
     positions = batch.positions
     if batch.pusher is not None:
@@ -178,7 +188,7 @@ def poses_of(batch: SceneBatch) -> tuple[np.ndarray, np.ndarray]:
 
 
 def camera_numbers(camera: Camera) -> Float[np.ndarray, "12"]:
-    """Position and the matrix from pixel coordinates to directions in the world."""
-    pose: Pose = camera.T_world_camera
+    """Return the position and the matrix from pixel coordinates to directions in the world."""
+    pose = camera.T_world_camera
     matrix = quaternion_to_matrix(pose.quaternion) @ np.linalg.inv(camera.intrinsics)
     return np.concatenate([pose.position, matrix.reshape(-1)])

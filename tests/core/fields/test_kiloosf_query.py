@@ -1,12 +1,11 @@
 import numpy as np
-import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from osfcore.fields.kiloosf import DENSITY_FLOOR, EMPTY_G, FEATURES, KiloOSF, network_size
 from osfcore.fields.kiloosf_query import KiloQuery
-from tests.core.render.scenes import ball, random_field
+from tests.support.rendered_scenes import ball
 
 F64 = {"dtype": torch.float64}
 
@@ -63,9 +62,9 @@ def by_hand(field: KiloOSF, x, light, view):
 
 def test_the_formulas_hold():
     field = full_field()
-    x, light, view = inside(field, 60)
+    x, light, view = inside(field, 40)
     ambient, direct, sigma = KiloQuery(field, **F64)(x, light, view)
-    for i in range(60):
+    for i in range(40):
         expected = by_hand(field, *(a[i].numpy() for a in (x, light, view)))
         np.testing.assert_allclose(ambient[i].detach(), expected[0], atol=1e-6)
         np.testing.assert_allclose(direct[i].detach(), expected[1], atol=1e-5)
@@ -83,20 +82,11 @@ def test_linear_features_are_interpolated_exactly(seed):
     np.testing.assert_allclose(KiloQuery(field, **F64).features(x).detach(), x.numpy() @ slope + offset, atol=2e-6)
 
 
-def test_corners_have_their_own_features():
-    field = full_field()
-    query = KiloQuery(field, **F64)
-    inner = np.argwhere(np.ones(field.index.shape)[:-1, :-1, :-1])
-    low = query.low.numpy()
-    found = query.features(torch.tensor(low + field.voxel * inner, **F64)).detach()
-    np.testing.assert_allclose(found, field.rows[field.index[tuple(inner.T)]], atol=1e-9)
-
-
 def test_gradients_are_right():
     """Of every kind of parameter and of the points, against finite differences."""
-    field = full_field(shape=(3, 3, 4), hidden=2)
+    field = full_field(shape=(3, 3, 3), hidden=1, cells=(2, 1, 1))
     query = KiloQuery(field, **F64)
-    x, light, view = inside(field, 5, margin=0.02)
+    x, light, view = inside(field, 3, margin=0.02)
 
     def value(x, rows, networks, ambient):
         numbers = {"rows": rows, "networks": networks, "ambient": ambient}
@@ -118,7 +108,8 @@ def test_every_parameter_learns():
     assert (query.ambient.grad != 0).all()
 
 
-@given(seed=st.integers(0, 10**6), count=st.integers(1, 40))
+@settings(max_examples=30)
+@given(seed=st.integers(0, 10**6), count=st.integers(0, 40))
 def test_points_do_not_depend_on_each_other(seed, count):
     """Neither their order nor how many are asked at once changes anything, however they fall into cells."""
     field = full_field()
@@ -132,11 +123,6 @@ def test_points_do_not_depend_on_each_other(seed, count):
     for whole, other, first, second in zip(together, shuffled, *parts, strict=True):
         np.testing.assert_allclose(whole[order].detach(), other.detach(), atol=1e-12)
         np.testing.assert_allclose(whole.detach(), torch.cat([first, second]).detach(), atol=1e-12)
-
-
-def test_no_points_give_nothing():
-    scatter = KiloQuery(full_field())(*torch.zeros(3, 0, 3))
-    assert [part.shape for part in scatter] == [(0, 3), (0, 3), (0,)]
 
 
 def test_there_is_nothing_outside_the_box():
@@ -160,19 +146,14 @@ def test_the_density_of_empty_space_is_exactly_zero():
 
 def test_row_units_scale_steps_but_not_values():
     field = full_field()
+    for name in ("origin", "index", "rows", "cells", "networks", "ambient"):
+        np.testing.assert_array_equal(getattr(KiloQuery(field).to_field(field), name), getattr(field, name))
     units = (10.0, 1, 1, 1, 2, 2, 2, 5)
     points = inside(field, 30)
     plain, scaled = KiloQuery(field, **F64), KiloQuery(field, row_units=units, **F64)
     for a, b in zip(plain(*points), scaled(*points), strict=True):
         np.testing.assert_allclose(a.detach(), b.detach(), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(scaled.to_field(field).rows, field.rows, rtol=1e-6)
-
-
-def test_a_field_survives_the_way_through_parameters():
-    field = random_field(np.random.default_rng(0))
-    back = KiloQuery(field).to_field(field)
-    for name in ("origin", "index", "rows", "cells", "networks", "ambient", "density", "macro"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(field, name))
 
 
 def test_jitter_asks_neighbouring_networks_only_near_the_border():
@@ -182,16 +163,8 @@ def test_jitter_asks_neighbouring_networks_only_near_the_border():
     low, high = field.box.astype(float)
     place = (x[:, 0].numpy() - low[0]) / (high[0] - low[0]) * 2
     plain = query(x, light, view).direct.detach().numpy()
-    jittered = (
-        query(x, light, view, cell_jitter=0.25, generator=torch.Generator().manual_seed(0)).direct.detach().numpy()
-    )
+    generator = torch.Generator().manual_seed(0)
+    jittered = query(x, light, view, cell_jitter=0.25, generator=generator).direct.detach().numpy()
     changed = np.any(plain != jittered, axis=1)
     assert changed.any()
     assert np.all(np.abs(place[changed] - 1) < 0.25)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_precision_is_as_asked(dtype):
-    field = full_field()
-    points = [a.to(dtype) for a in inside(field, 10)]
-    assert {part.dtype for part in KiloQuery(field, dtype=dtype)(*points)} == {dtype}

@@ -3,13 +3,13 @@ import pytest
 import torch
 
 from osfcore.errors import InvalidInput
-from osfcore.fields.osf import DENSITY_GAIN, OSF, OSFSize, encoding, outgoing_radiance
+from osfcore.fields.osf import DENSITY_GAIN, OSF, OSFSize, encoding
 
 BOX = np.array([[-0.1, -0.2, 0.0], [0.1, 0.2, 0.6]])
 
 
-def made(size=None, box=BOX, seed=0):
-    return OSF(box, size or OSFSize(4, 32), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+def made(box=BOX, seed=0):
+    return OSF(box, OSFSize(4, 32), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def queries(count=64, seed=1):
@@ -30,27 +30,13 @@ def test_an_encoding_is_the_values_and_sines_of_their_doubles():
 
 def test_light_and_view_change_the_direct_part_alone():
     osf, (x, light, view) = made(), queries()
-    before, other_light, other_view = osf(x, light, view), osf(x, -light, view), osf(x, light, -view)
-    for after in (other_light, other_view):
+    before = osf(x, light, view)
+    for after in (osf(x, -light, view), osf(x, light, -view)):
         assert torch.equal(before.sigma, after.sigma)
         assert torch.equal(before.ambient, after.ambient)
         assert (before.direct - after.direct).abs().max() > 1e-3
     assert (before.sigma > 0).all()
     assert (before.direct > 0).all()
-    assert before.sigma.std() > 1e-3 * before.sigma.mean()
-
-
-def test_radiance_is_linear_in_the_lights_intensity_and_ambient_without_it():
-    osf, asked = made(), queries()
-    scatter = osf(*asked)
-    assert torch.equal(outgoing_radiance(scatter, 0.0), scatter.ambient)
-    one, three = (outgoing_radiance(scatter, i, 0.0) for i in (1.0, 3.0))
-    torch.testing.assert_close(three, 3 * one)
-    both = outgoing_radiance(scatter, 2.0, 0.5)
-    torch.testing.assert_close(both, 2 * scatter.direct + 0.5 * scatter.ambient)
-    red = torch.zeros(len(one), 3, dtype=torch.float64)
-    red[:, 0] = 1
-    assert (outgoing_radiance(scatter, red, 0.0)[:, 1:] == 0).all()
 
 
 def test_only_the_place_within_the_box_matters():
@@ -83,32 +69,17 @@ def test_density_and_material_agree_with_the_whole():
     torch.testing.assert_close(albedo * osf.ambient, scatter.ambient)
 
 
-@pytest.mark.parametrize(("depth", "width"), [(2, 8), (4, 64), (8, 256)])
-def test_depth_and_width_are_those_asked_for(depth, width):
-    found = sum(p.numel() for p in OSF(BOX, OSFSize(depth, width)).parameters())
-    place, direction, half = 63, 27, width // 2
-    trunk = (place + 1) * width + (depth - 1) * (width + 1) * width + place * width  # the position enters twice
-    heads = (width + 1) * (4 + width) + (width + 2 * direction + 1) * half + (half + 1) * 3
-    assert found == trunk + heads + 3
-
-
-def test_every_parameter_learns():
-    osf, asked = made(), queries()
+def test_every_parameter_learns_and_the_generator_alone_draws_it():
+    osf, asked = made(seed=3), queries()
     scatter = osf(*asked)
     (scatter.direct.sum() + scatter.ambient.sum() + scatter.sigma.sum()).backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in osf.parameters())
-
-
-def test_the_generator_alone_draws_the_weights():
-    asked = queries()
-    torch.manual_seed(1)
-    first = made(seed=3)(*asked)
     torch.manual_seed(2)
-    assert torch.equal(first.direct, made(seed=3)(*asked).direct)
-    assert not torch.equal(first.direct, made(seed=4)(*asked).direct)
+    assert torch.equal(scatter.direct, made(seed=3)(*asked).direct)
+    assert not torch.equal(scatter.direct, made(seed=4)(*asked).direct)
 
 
 @pytest.mark.parametrize(("depth", "width"), [(1, 64), (17, 64), (4, 7), (4, 1025)])
 def test_sizes_out_of_range_are_refused(depth, width):
-    with pytest.raises(InvalidInput, match="between"):
+    with pytest.raises(InvalidInput):
         OSFSize(depth, width)

@@ -11,22 +11,25 @@ from osfcore.geometry.light import SpotLamp
 from osfcore.geometry.poses import quaternion_exp
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.paper.rendering import PaperRenderer
-from osfcore.render.reference import render_on_device, render_reference
+from osfcore.render.reference import render_on_device
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import EXACT, OUTPUTS, PLANNING, Quality, SceneBatch
-from tests.core.render.scenes import UPRIGHT, ball, block, plain_table, random_scene, state, view, wooden_table
+from tests.support.rendered_scenes import (
+    UPRIGHT,
+    ball,
+    block,
+    both,
+    plain_table,
+    random_scene,
+    state,
+    view,
+    wooden_table,
+)
 
 ALBEDO = 0.5  # of the plain table
 ROUNDING = 1e-5  # of sums of single precision: near lamps and distant lights are compiled apart
 LAMP = SpotLamp(np.array([0.25, -0.15, 0.45]), np.array([0.02, 0.03, 0.0]), 25, 40)
 WIDE = SpotLamp(np.array([0.25, -0.15, 0.45]), np.zeros(3), 80, 90)
-
-
-def both(fields, table, scene, spot, camera, quality=EXACT):
-    """Everything from one camera, from the reference and from the fast path."""
-    slow = render_reference(fields, table, scene, camera, spot=spot, quality=quality, outputs=OUTPUTS)
-    fast = SceneRenderer(fields, table).render(SceneBatch.of(scene, spot), [camera], quality=quality, outputs=OUTPUTS)
-    return slow, fast
 
 
 def seen_points(camera: Camera) -> np.ndarray:
@@ -54,86 +57,40 @@ def test_the_empty_table_falls_off_and_has_the_cones_edge(spot):
     lit = 0.75 * spot.toward(points)[..., 2] * spot.falloff(points) * spot.spot_factor(points)
     off_the_edge = np.abs(spot.spot_factor(points + 1e-5) - spot.spot_factor(points - 1e-5)) < 0.01
     assert off_the_edge.mean() > 0.9
-    for rendered in both({}, plain_table(ALBEDO), state({}), spot, camera):
+    for rendered in both({}, plain_table(ALBEDO), state({}), camera, spot=spot):
         expected = np.broadcast_to(ALBEDO * (0.25 + lit[..., None]), (24, 24, 3))
         np.testing.assert_allclose(rendered.rgb[0, 0][off_the_edge], expected[off_the_edge], atol=1e-5)
 
 
-@pytest.mark.parametrize("factor", [0.75, 2.0])
-def test_light_falls_off_with_the_square_of_the_distance(factor):
-    """Below a lamp overhead, on the top of a block nearer to it than the table is; there it is as a distant light."""
-    camera = view((0, 0, 2.0), (0, 0, 0), 16, 0.2)
-    spot = SpotLamp(np.array([0, 0, 0.4 * factor]), np.zeros(3), 60, 60)
-    for rendered in both({}, plain_table(ALBEDO), state({}), spot, camera):
-        np.testing.assert_allclose(rendered.rgb, ALBEDO, atol=1e-3)
-    top = {"block": block((0.05, 0.05, 0.02), voxel=0.002, albedo=(0.5, 0.5, 0.5))}
-    for rendered in both(top, None, state({"block": (0, 0, 0.1)}), spot, camera):
-        gain = (0.4 * factor / (0.4 * factor - 0.12)) ** 2
-        np.testing.assert_allclose(
-            rendered.rgb[0, 0, 8, 8], 0.5 * (0.25 + 0.75 * gain), rtol=0.015
-        )  # samples lie a little below the surface
-
-
-@pytest.mark.parametrize("seed", [1, 2, 5])
-def test_a_lamp_200_m_away_is_the_distant_light(seed):
-    fields, scene = random_scene(seed)
+def test_a_lamp_200_m_away_is_the_distant_light():
+    fields, scene = random_scene(1)
     spot = SpotLamp(200 * scene.light.direction, np.zeros(3), 10, 20)
-    for rendered, distant in zip(
-        both(fields, wooden_table(), scene, spot, view(size=24)),
-        both(fields, wooden_table(), scene, None, view(size=24)),
-        strict=True,
-    ):
+    pairs = (both(fields, wooden_table(), scene, view(size=16), spot=one) for one in (spot, None))
+    for rendered, distant in zip(*pairs, strict=True):
         np.testing.assert_allclose(rendered.rgb, distant.rgb, atol=5e-3)
         np.testing.assert_allclose(rendered.opacity, distant.opacity, atol=ROUNDING)
 
 
-def test_nothing_but_the_light_changes():
-    fields, scene = random_scene(4)
-    fast = SceneRenderer(fields, wooden_table())
-    near, distant = (fast.render(SceneBatch.of(scene, spot), [view()], outputs=OUTPUTS) for spot in (LAMP, None))
-    for name in ("opacity", "masks", "depth"):
-        np.testing.assert_allclose(getattr(near, name), getattr(distant, name), atol=ROUNDING)
-    assert np.abs(near.rgb - distant.rgb).max() > 0.05
-
-
-def test_the_shadow_of_a_box_is_its_perspective_projection():
+@pytest.mark.parametrize("lamp", [(0.2, 0.05, 0.3), (-0.1, 0.2, 0.16)])
+def test_the_shadow_of_a_box_is_its_perspective_projection(lamp):
     """A point of the table is dark if the way to the lamp passes through the box (slab method)."""
     half, centre = np.array([0.03, 0.02, 0.05]), np.array([0.0, 0.0, 0.05])
     camera = view((0, 0, 1.5), (0, 0, 0), 96, 18.0)
-    points = seen_points(camera)
-    for lamp in ((0.2, 0.05, 0.3), (-0.1, 0.2, 0.16)):
-        spot = SpotLamp(np.array(lamp), centre, 80, 90)
-        ways = spot.position - points
-        with np.errstate(divide="ignore"):
-            enter, leave = np.sort([(centre - half - points) / ways, (centre + half - points) / ways], axis=0)
-        dark = np.maximum(enter.max(axis=-1), 0) < np.minimum(leave.min(axis=-1), 1)
-        fields = {"box": block(half, voxel=0.0025)}
-        for rendered in both(fields, plain_table(ALBEDO), state({"box": centre}), spot, camera):
-            on_table = rendered.opacity[0, 0, 0] < 1e-3
-            open_table = ALBEDO * (0.25 + 0.75 * spot.toward(points)[..., 2] * spot.falloff(points))
-            shaded = rendered.rgb[0, 0, ..., 0] < (open_table + 0.25 * ALBEDO) / 2
-            union = (shaded | dark) & on_table
-            assert union.sum() > 200
-            assert (shaded & dark & on_table).sum() > 0.92 * union.sum()
-            core = shaded & dark & on_table & (rendered.rgb[0, 0, ..., 0] < 0.126)
-            assert core.sum() > 0.85 * union.sum()  # ambient light alone
-
-
-def test_the_shadow_of_a_ball_is_the_cone_around_it():
-    radius, centre = 0.04, np.array([0.02, -0.01, 0.09])
-    camera = view((0, 0, 1.5), (0, 0, 0), 96, 20.0)
-    points, spot = seen_points(camera), SpotLamp(np.array([-0.15, 0.1, 0.35]), np.zeros(3), 80, 90)
-    away = points - spot.position
-    to_centre = centre - spot.position
-    share = np.clip(away @ to_centre / np.sum(away**2, axis=-1), 0, 1)
-    dark = np.linalg.norm(share[..., None] * away - to_centre, axis=-1) < radius
-    for rendered in both(
-        {"ball": ball(radius, voxel=0.0025)}, plain_table(ALBEDO), state({"ball": centre}), spot, camera
-    ):
+    points, spot = seen_points(camera), SpotLamp(np.array(lamp), centre, 80, 90)
+    ways = spot.position - points
+    with np.errstate(divide="ignore"):
+        enter, leave = np.sort([(centre - half - points) / ways, (centre + half - points) / ways], axis=0)
+    dark = np.maximum(enter.max(axis=-1), 0) < np.minimum(leave.min(axis=-1), 1)
+    fields = {"box": block(half, voxel=0.0025)}
+    for rendered in both(fields, plain_table(ALBEDO), state({"box": centre}), camera, spot=spot):
         on_table = rendered.opacity[0, 0, 0] < 1e-3
         open_table = ALBEDO * (0.25 + 0.75 * spot.toward(points)[..., 2] * spot.falloff(points))
         shaded = rendered.rgb[0, 0, ..., 0] < (open_table + 0.25 * ALBEDO) / 2
-        assert (shaded & dark & on_table).sum() > 0.94 * ((shaded | dark) & on_table).sum() > 200
+        union = (shaded | dark) & on_table
+        assert union.sum() > 200
+        assert (shaded & dark & on_table).sum() > 0.92 * union.sum()
+        core = shaded & dark & on_table & (rendered.rgb[0, 0, ..., 0] < 0.126)
+        assert core.sum() > 0.85 * union.sum()  # ambient light alone
 
 
 def test_what_lies_beyond_the_lamp_casts_no_shadow():
@@ -142,7 +99,7 @@ def test_what_lies_beyond_the_lamp_casts_no_shadow():
     camera = view((0.4, 0, 0.1), (0, 0, 0), 24, 20.0)
     spot = SpotLamp(np.array([0, 0, 0.3]), np.zeros(3), 60, 70)
     empty, beyond, between = (
-        both(fields if names else {}, plain_table(), state(names), spot, camera)
+        both(fields if names else {}, plain_table(), state(names), camera, spot=spot)
         for names in ({}, {"plate": (0, 0, 0.4)}, {"plate": (0, 0, 0.2)})
     )
     for open_table, unshaded, shaded in zip(empty, beyond, between, strict=True):
@@ -158,37 +115,30 @@ def test_sides_that_face_the_lamp_are_bright_and_others_are_not():
     for side in (-1, 1):
         middle = np.array([0.16 * side, 0, 0.04])  # of the face toward the lamp
         bright = 0.25 + 0.75 * spot.falloff(middle) * spot.toward(middle)[0] * -side
-        within, beyond = (
-            view((0, 0, 0.15), middle, 16, 4.0),
-            view((0.6 * side, 0, 0.15), middle + [0.08 * side, 0, 0], 16, 4.0),
-        )
+        within = view((0, 0, 0.15), middle, 16, 4.0)
+        beyond = view((0.6 * side, 0, 0.15), middle + [0.08 * side, 0, 0], 16, 4.0)
         for camera, expected in ((within, bright), (beyond, 0.25)):
-            for rendered in both(fields, None, scene, spot, camera):
+            for rendered in both(fields, None, scene, camera, spot=spot):
                 np.testing.assert_allclose(rendered.rgb[0, 0, 8, 8], np.array([0.3, 0.6, 0.8]) * expected, rtol=0.03)
 
 
-# Seeds are chosen so that one, two and four objects and pushers occur.
-@pytest.mark.parametrize("seed", [1, 2, 6, 9, 11])
+@pytest.mark.parametrize("seed", [1, 6, 9])
 def test_exact_is_the_reference(seed):
     fields, scene = random_scene(seed)
     table = None if seed % 3 == 0 else wooden_table(seed=seed)
-    camera = view(np.random.default_rng(seed).normal(size=3) * 0.1 + [0.35, 0, 0.3], size=20, fov_y_deg=50)
-    slow, fast = both(fields, table, scene, random_lamp(seed), camera)
+    camera = view(np.random.default_rng(seed).normal(size=3) * 0.1 + [0.35, 0, 0.3], size=16, fov_y_deg=50)
+    slow, fast = both(fields, table, scene, camera, spot=random_lamp(seed))
     for name in ("rgb", "opacity", "depth"):
         np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), atol=2e-3, err_msg=name)
-    assert fast.rgb.dtype == np.float32
+    there = render_on_device(fields, table, SceneBatch.of(scene, random_lamp(seed)), [camera], "cpu", EXACT, OUTPUTS)
+    np.testing.assert_allclose(there.rgb, fast.rgb, atol=2e-3)
 
 
 def test_a_trained_tables_answer_to_the_lights_direction_counts():
     """Its network is asked for the direction at every point."""
     rng = np.random.default_rng(0)
-    table = replace(
-        wooden_table(),
-        w1=rng.normal(size=(3, 6)).astype(np.float32),
-        b1=rng.normal(size=6).astype(np.float32),
-        w2=0.3 * rng.normal(size=(6, 3)).astype(np.float32),
-    )
-    slow, fast = both({}, table, state({}), LAMP, view(size=24))
+    w1, b1, w2 = (rng.normal(size=shape).astype(np.float32) for shape in ((3, 6), 6, (6, 3)))
+    slow, fast = both({}, replace(wooden_table(), w1=w1, b1=b1, w2=0.3 * w2), state({}), view(size=24), spot=LAMP)
     np.testing.assert_allclose(fast.rgb, slow.rgb, atol=1e-5)
 
 
@@ -200,10 +150,9 @@ def test_no_shadow_is_cut_off(lamp):
     camera, tilt = view((0.3, 0.2, 0.6), (0, 0, 0), 48, 70), quaternion_exp(np.array([0.3, 0.5, 0]))
     renderer = SceneRenderer(fields, plain_table(half_side=2.0))
     for height in (0.06, 0.01):
-        pose = ((0.05, 0, height), tilt)
-        one = state({"block": pose}, pusher=(-0.1, 0.1, PUSHER_CENTRE_Z_M))
-        two = state({"block": pose, "glass": ((0, 0, 0), UPRIGHT)}, pusher=(-0.1, 0.1, PUSHER_CENTRE_Z_M))
-        a, b = (renderer.render(SceneBatch.of(s, spot), [camera]).rgb for s in (one, two))
+        poses, glass = {"block": ((0.05, 0, height), tilt)}, {"glass": ((0, 0, 0), UPRIGHT)}
+        scenes = (state(p, pusher=(-0.1, 0.1, PUSHER_CENTRE_Z_M)) for p in (poses, poses | glass))
+        a, b = (renderer.render(SceneBatch.of(s, spot), [camera]).rgb for s in scenes)
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
@@ -211,23 +160,22 @@ def test_no_shadow_is_cut_off(lamp):
 def test_a_batch_is_its_scenes_one_by_one(quality):
     """Whose lamps are equal, or differ in nothing but the place, the aim or the cone."""
     fields, scene = random_scene(9)
-    moved = (LAMP, replace(LAMP, position=LAMP.position + 0.05), LAMP, replace(LAMP, aim=np.array([0.1, 0, 0])),
+    lamps = (LAMP, replace(LAMP, position=LAMP.position + 0.05), LAMP, replace(LAMP, aim=np.array([0.1, 0, 0])),
              replace(LAMP, outer_deg=60), replace(LAMP, inner_deg=30))  # fmt: skip
     one = SceneBatch.of(scene)
-    parts = [np.repeat(a, len(moved), axis=0) for a in (one.positions, one.quaternions, one.lights)]
-    pusher = None if one.pusher is None else np.repeat(one.pusher, len(moved), axis=0)
-    batch = SceneBatch(one.names, *parts, pusher, moved)
+    parts = [np.repeat(a, len(lamps), axis=0) for a in (one.positions, one.quaternions, one.lights)]
+    pusher = None if one.pusher is None else np.repeat(one.pusher, len(lamps), axis=0)
     renderer = SceneRenderer(fields, wooden_table())
+    batch = SceneBatch(one.names, *parts, pusher, lamps)
     whole = renderer.render(batch, [view(size=24)], quality=quality, outputs=OUTPUTS)
-    for b, spot in enumerate(moved):
+    for b, spot in enumerate(lamps):
         single = renderer.render(SceneBatch.of(scene, spot), [view(size=24)], quality=quality, outputs=OUTPUTS)
         for name in ("rgb", "opacity", "masks", "depth"):
             np.testing.assert_array_equal(getattr(whole, name)[b], getattr(single, name)[0], err_msg=name)
     assert not any(np.array_equal(whole.rgb[0], whole.rgb[b]) for b in (1, 3, 4, 5))
-    np.testing.assert_array_equal(whole.rgb[0], whole.rgb[2])
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_planning_stays_above_40_db(seed):
     rng = np.random.default_rng(seed)
     fields = {"a": block(rng.uniform(0.02, 0.05, 3), voxel=0.002), "b": ball(rng.uniform(0.02, 0.05), voxel=0.002)}
@@ -238,18 +186,10 @@ def test_planning_stays_above_40_db(seed):
     assert -10 * np.log10(np.mean((planned - exact) ** 2)) > 40
 
 
-def test_a_device_draws_the_same():
-    fields, scene = random_scene(2)
-    batch, cameras = SceneBatch.of(scene, LAMP), [view(size=16)]
-    there = render_on_device(fields, wooden_table(), batch, cameras, "cpu", EXACT, OUTPUTS)
-    here = SceneRenderer(fields, wooden_table()).render(batch, cameras)
-    np.testing.assert_allclose(there.rgb, here.rgb, atol=2e-3)
-
-
-def test_lamps_are_counted_and_the_published_renderer_knows_none():
+def test_lamps_are_counted_and_the_published_renderer_takes_none():
     one = SceneBatch.of(state({}), LAMP)
     np.testing.assert_allclose(one.lights[0], LAMP.direction, atol=1e-12)
-    with pytest.raises(InvalidInput, match="number of lamps of a batch is 2, but it must be 1, one for each scene"):
+    with pytest.raises(InvalidInput):
         replace(one, spots=(LAMP, LAMP))
-    with pytest.raises(InvalidInput, match="published renderer is a lamp at a finite distance"):
+    with pytest.raises(InvalidInput):
         PaperRenderer({}, plain_table()).render(one, [view()])

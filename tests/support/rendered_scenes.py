@@ -11,7 +11,9 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
-from osfcore.render.reference import solid_field
+from osfcore.render.reference import render_reference, solid_field
+from osfcore.render.renderer import SceneRenderer
+from osfcore.render.types import EXACT, OUTPUTS, Rendered, SceneBatch
 
 HIDDEN = 8
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -126,3 +128,17 @@ def random_scene(seed: int, count: int | None = None) -> tuple[dict[str, KiloOSF
 
 def view(position=(0.5, 0.1, 0.4), target=(0.0, 0.0, 0.03), size: int = 32, fov_y_deg: float = 40.0) -> Camera:
     return Camera.look_at("view", position, target, size=size, fov_y_deg=fov_y_deg)
+
+
+def camera_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions through all pixel centres, row by row, in single precision."""
+    row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
+    directions = camera.ray_directions(np.stack([column + 0.5, row + 0.5], axis=1)).astype(np.float32)
+    return np.broadcast_to(camera.T_world_camera.position.astype(np.float32), directions.shape), directions
+
+
+def both(fields, table, scene: SceneState, camera: Camera, quality=EXACT, spot=None) -> tuple[Rendered, Rendered]:
+    """Everything from one camera, from the reference and from the fast path."""
+    slow = render_reference(fields, table, scene, camera, spot=spot, quality=quality, outputs=OUTPUTS)
+    fast = SceneRenderer(fields, table).render(SceneBatch.of(scene, spot), [camera], quality=quality, outputs=OUTPUTS)
+    return slow, fast

@@ -13,7 +13,7 @@ from osfcore.fields.train_kiloosf import Recipe
 from osfcore.geometry.cameras import Camera
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import Quality, SceneBatch
-from tests.core.render.scenes import UPRIGHT, ball, block, coloured
+from tests.support.rendered_scenes import UPRIGHT, ball, block, coloured
 
 QUICK = Recipe(coarse_across=16, fine_across=24, cells=2, hidden=8, rays=512)
 
