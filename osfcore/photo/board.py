@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -12,31 +11,40 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from osfcore.errors import InvalidInput, UnknownName, check_ranges
+from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.poses import Pose, quaternion_from_matrix
 
-# ArUco and AprilTag markers: which dictionaries there are, and where markers lie in a photograph, roughly.
+Grey = UInt8[np.ndarray, "h w"]
+Image8 = UInt8[np.ndarray, "h w *channels"]
+Intrinsics = Float[np.ndarray, "3 3"]
+Homography = Float[np.ndarray, "3 3"]
+Points = Float[np.ndarray, "N 2"]
+
+
+def camera_matrix(focal: float, x: float, y: float) -> Intrinsics:
+    """Return K of a camera with square pixels, from its focal length and principal point [px]."""
+    return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
+
+
+def px_scale(size: tuple[int, int]) -> float:
+    """Return how many times more pixels errors may have in a photograph of this size than in a small one."""
+    return max(1.0, max(size) / _WORKING_SIDES[0])
+
+
+def on_plane(points_m: Points) -> Float[np.ndarray, "N 3"]:
+    """Return points of the print's plane z = 0 in its frame [m]."""
+    return np.pad(points_m, ((0, 0), (0, 1)))
+
+
+# ArUco markers: which dictionaries there are, and roughly where markers lie in a photograph.
 
 
 _DETECTION_SIDE = 1920  # smaller photographs are enlarged towards it: markers of 10 px are read far more often
 _MAX_MARKER_ENLARGEMENT = 3.0
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Marker:
-    """One marker in a photograph; it may be a mistake, since marks are read leniently.
-
-    Attributes:
-        number: of the marker in its dictionary.
-        corners_px: of its black border: top left, top right, bottom right, bottom left of the print [px].
-    """
-
-    number: int
-    corners_px: Float[np.ndarray, "4 2"]
-
-
 def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """A predefined dictionary of OpenCV, such as "DICT_4X4_50".
+    """Return a predefined dictionary of OpenCV, such as "DICT_4X4_50".
 
     Raises:
         UnknownName: if OpenCV has none of that name.
@@ -47,26 +55,25 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(known[name])
 
 
-def find_markers(grey: UInt8[np.ndarray, "h w"], dictionary: cv2.aruco.Dictionary) -> list[Marker]:
-    """Markers of a dictionary, about one pixel exact.
+def find_markers(
+    grey: Grey, dictionary: cv2.aruco.Dictionary
+) -> tuple[Int[np.ndarray, "M"], Float[np.ndarray, "M 4 2"]]:
+    """Find the markers of a dictionary, about one pixel exact.
 
     Bits are read leniently, which finds twice as many markers of 10 px as OpenCV's defaults, and wrong ones: whoever
     asks has to check them against what was printed.
 
-    Args:
-        grey: the photograph.
-        dictionary: of the markers.
+    Returns:
+        Their numbers in the dictionary, and the corners of their black borders: top left, top right, bottom right,
+        bottom left of the print [px].
     """
     scale = min(max(_DETECTION_SIDE / max(grey.shape), 1.0), _MAX_MARKER_ENLARGEMENT)
     large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC) if scale > 1 else grey
-    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, _lenient_parameters()).detectMarkers(large)
+    quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary, _lenient_parameters()).detectMarkers(large)
     if numbers is None:
-        return []
-    sizes = np.divide(grey.shape[::-1], large.shape[::-1])
-    return [
-        Marker(int(number), (quad.reshape(4, 2).astype(float) + 0.5) * sizes)
-        for quad, number in zip(corners, np.ravel(numbers), strict=True)
-    ]
+        return np.zeros(0, int), np.zeros((0, 4, 2))
+    corners = np.reshape(quads, (-1, 4, 2)).astype(float)
+    return np.ravel(numbers), (corners + 0.5) * np.divide(grey.shape[::-1], large.shape[::-1])
 
 
 def _lenient_parameters() -> cv2.aruco.DetectorParameters:
@@ -106,9 +113,7 @@ _MAX_ENLARGEMENT = 3
 _MARGIN_PX = 2
 _FAR_PX = 1e6  # no print reaches so far
 _PIXEL_CENTRE = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # from indices to coordinates [px]
-PATCH_CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
-
-Homography = Float[np.ndarray, "3 3"]
+_PATCH_CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -137,8 +142,8 @@ class FoundPoints:
         points_px: in the photograph [px].
     """
 
-    points_m: Float[np.ndarray, "N 2"]
-    points_px: Float[np.ndarray, "N 2"]
+    points_m: Points
+    points_px: Points
 
 
 NOTHING = FoundPoints(np.empty((0, 2)), np.empty((0, 2)))
@@ -150,7 +155,7 @@ def transform(homography: Homography, points: Float[np.ndarray, "*batch 2"]) -> 
     return mapped[..., :2] / mapped[..., 2:]
 
 
-def find_points(grey: UInt8[np.ndarray, "h w"], pattern: Pattern, guess: Homography) -> FoundPoints:
+def find_points(grey: Grey, pattern: Pattern, guess: Homography) -> FoundPoints:
     """Align a pattern with a photograph.
 
     In turn each patch's shift d is found, for which the photograph is closest to a R(x - d) + b with the print R drawn
@@ -185,8 +190,8 @@ def find_points(grey: UInt8[np.ndarray, "h w"], pattern: Pattern, guess: Homogra
     return found
 
 
-def _seen_patches(grey: UInt8[np.ndarray, "h w"], pattern: Pattern, homography: Homography) -> FoundPoints:
-    """Where patches lie, near where the homography puts them, without those that are less like the print than most."""
+def _seen_patches(grey: Grey, pattern: Pattern, homography: Homography) -> FoundPoints:
+    """Find the patches near where the homography puts them, without those that are less like the print than most."""
     fine, enlargement = _resampled(pattern, homography)
     seen = np.array([_patch_shift(grey, fine, homography, centre, enlargement) for centre in pattern.centres_m])
     there = np.isfinite(seen[:, 2])
@@ -199,8 +204,8 @@ def _seen_patches(grey: UInt8[np.ndarray, "h w"], pattern: Pattern, homography: 
 
 
 def _resampled(pattern: Pattern, homography: Homography) -> tuple[Pattern, int]:
-    """The pattern about as fine as it is drawn, and how many times finer than the photograph it is drawn."""
-    quads = transform(homography, pattern.centres_m[:, None] + pattern.patch_m * PATCH_CORNERS)
+    """Return the pattern about as fine as it is drawn, and how many times finer than the photograph that is."""
+    quads = transform(homography, pattern.centres_m[:, None] + pattern.patch_m * _PATCH_CORNERS)
     side_px = float(np.median(np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).max(axis=1)))
     enlargement = int(np.clip(np.ceil(_FINE_PATCH_PX / max(side_px, 1.0)), 1, _MAX_ENLARGEMENT))
     pixels = enlargement * side_px / pattern.patch_m * np.array(pattern.size_m)
@@ -211,15 +216,11 @@ def _resampled(pattern: Pattern, homography: Homography) -> tuple[Pattern, int]:
 
 
 def _patch_shift(
-    grey: UInt8[np.ndarray, "h w"],
-    pattern: Pattern,
-    homography: Homography,
-    centre_m: Float[np.ndarray, "2"],
-    enlargement: int,
+    grey: Grey, pattern: Pattern, homography: Homography, centre_m: Float[np.ndarray, "2"], enlargement: int
 ) -> Float[np.ndarray, "3"]:
-    """How far a patch lies from where the homography puts it [px], and the correlation; NaN if it is not there."""
+    """Return a patch's shift from where the homography puts it [px] and the correlation; NaN if it is not there."""
     missing = np.full(3, np.nan)
-    quad = transform(homography, centre_m + pattern.patch_m * PATCH_CORNERS)
+    quad = transform(homography, centre_m + pattern.patch_m * _PATCH_CORNERS)
     size = np.array(grey.shape[::-1])
     if not np.all(np.abs(quad) < _FAR_PX) or not np.all((quad.mean(axis=0) > 0) & (quad.mean(axis=0) < size)):
         return missing
@@ -244,7 +245,7 @@ def _patch_shift(
 def _drawn(
     pattern: Pattern, homography: Homography, low: Int[np.ndarray, "2"], high: Int[np.ndarray, "2"], enlargement: int
 ) -> Float[np.ndarray, "h w"]:
-    """What a camera shows of a pattern between two corners of its image, with values from 0 to 1."""
+    """Draw what a camera shows of a pattern between two corners of its image, with values from 0 to 1."""
     height, width = pattern.image.shape
     from_pixels = np.array(
         [
@@ -261,7 +262,7 @@ def _drawn(
     return (_INK + (1 - _INK) * light) ** _GAMMA
 
 
-# Where a camera stands that sees known points of the table plane, and its focal length.
+# The pose and the focal length of a camera that sees known points of the table plane.
 
 
 _FOCAL_FLAGS = (
@@ -273,15 +274,13 @@ _FOCAL_FLAGS = (
     | cv2.CALIB_FIX_K2
     | cv2.CALIB_FIX_K3
 )
-UNTOLD = "focal length"  # of the error for a view that does not tell it
+UNKNOWN_FOCAL = "focal length"  # `InvalidInput.what` of a view that does not determine it
 _MAX_FOCAL_STD = 0.03  # of the focal length
 _FOCAL_RANGE = (0.3, 10.0)  # focal lengths of cameras, in longer sides of the image
 
 
-def planar_pose(
-    points_m: Float[np.ndarray, "N 2"], points_px: Float[np.ndarray, "N 2"], intrinsics: Float[np.ndarray, "3 3"]
-) -> tuple[Pose, float]:
-    """The pose of a camera that sees at least 4 points of the table plane.
+def planar_pose(points_m: Points, points_px: Points, intrinsics: Intrinsics) -> tuple[Pose, float]:
+    """Return the pose of a camera that sees at least 4 points of the table plane.
 
     A plane seen from afar fits two poses almost equally well (Collins and Bartoli 2014); both are refined, and the
     one with the smaller reprojection error above the table is taken.
@@ -297,7 +296,7 @@ def planar_pose(
     Raises:
         InvalidInput: if the camera would have to be below the table.
     """
-    points, pixels = np.pad(points_m, ((0, 0), (0, 1))), np.ascontiguousarray(points_px, float)
+    points, pixels = on_plane(points_m), np.ascontiguousarray(points_px, float)
     _, rotations, translations, _ = cv2.solvePnPGeneric(points, pixels, intrinsics, None, flags=cv2.SOLVEPNP_IPPE)
     best: tuple[Pose, float] | None = None
     for start in zip(rotations, translations, strict=True):
@@ -315,10 +314,8 @@ def planar_pose(
     return best
 
 
-def focal_length(
-    points_m: Float[np.ndarray, "N 2"], points_px: Float[np.ndarray, "N 2"], size: tuple[int, int], accuracy_px: float
-) -> tuple[float, float]:
-    """The focal length from one view of a plane, for square pixels, no distortion and a centred principal point.
+def focal_length(points_m: Points, points_px: Points, size: tuple[int, int], accuracy_px: float) -> tuple[float, float]:
+    """Estimate the focal length from a view of a plane, for square pixels, no distortion, a centred principal point.
 
     Args:
         points_m: x, y of the points on the table [m].
@@ -333,17 +330,17 @@ def focal_length(
         InvalidInput: if the standard deviation is above 3 %: seen from straight above, a plane looks the same through a
             long lens from afar as through a short one from near by.
     """
-    fit = calibrated(points_m, points_px, size, accuracy_px)
+    fit = fit_focal(points_m, points_px, size, accuracy_px)
     if fit is None or fit.focal_std > _MAX_FOCAL_STD * fit.focal:
         raise InvalidInput(
-            UNTOLD, "unknown, and the print is too small in this view, or seen too steeply, to tell it",
+            UNKNOWN_FOCAL, "unknown, and the print is too small in this view, or seen too steeply, to tell it",
             "given, or the photograph taken from near by and at a slant, 30 to 60 degrees above the table",
         )  # fmt: skip
     return fit.focal, fit.focal_std
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Calibration:
+class FocalFit:
     """A camera with square pixels and a centred principal point that fits one view of a plane.
 
     Attributes:
@@ -359,16 +356,14 @@ class Calibration:
     translation: Float[np.ndarray, "3"]
 
 
-def calibrated(
-    points_m: Float[np.ndarray, "N 2"], points_px: Float[np.ndarray, "N 2"], size: tuple[int, int], accuracy_px: float
-) -> Calibration | None:
-    """The camera whose focal length fits best; None if no usual focal length fits. Arguments as of `focal_length`."""
-    points = [np.pad(points_m, ((0, 0), (0, 1))).astype(np.float32)]
+def fit_focal(points_m: Points, points_px: Points, size: tuple[int, int], accuracy_px: float) -> FocalFit | None:
+    """Fit pose and focal length; None if no usual focal length fits. Arguments as of `focal_length`."""
+    points = [on_plane(points_m).astype(np.float32)]
     pixels = [np.ascontiguousarray(points_px, np.float32)]
     guess = cv2.initCameraMatrix2D(points, pixels, size)[0, 0]
     low, high = np.multiply(_FOCAL_RANGE, max(size))
     start = float(guess) if low < guess < high else float(max(size))
-    matrix = np.array([[start, 0, size[0] / 2], [0, start, size[1] / 2], [0, 0, 1]])
+    matrix = camera_matrix(start, size[0] / 2, size[1] / 2)
     _, matrix, _, rotations, translations = cv2.calibrateCamera(
         points, pixels, size, matrix, np.zeros(5), flags=_FOCAL_FLAGS
     )
@@ -381,27 +376,24 @@ def calibrated(
     if not low < focal < high:
         return None
     deviation = float(max(scatter_px, accuracy_px) / max(pivot, 1e-12))
-    return Calibration(focal, deviation, rotations[0].ravel(), translations[0].ravel())
+    return FocalFit(focal, deviation, rotations[0].ravel(), translations[0].ravel())
 
 
-# The printed calibration board, which gives the camera of one photograph of a table; single markers do it too.
+# The printed calibration board, which gives the camera of one photograph of a table.
 #
 # The table frame: the print lies flat on the table, its centre is the origin, x runs along its top edge to the
 # right, y towards its top, z up.
 
 
 PAGE_M = (0.297, 0.21)  # A4, landscape
-TAG_DICTIONARY = "DICT_APRILTAG_36h11"
 SQUARE_PIXELS = 384  # of a square of the board, when drawn
 _MIN_MARGIN_M = 0.008
 _MIN_CORNERS = 6
-_CELL_PIXELS = 32  # of a cell of a tag, when drawn
 _GUESS_PX = 2.0  # by which corners of markers may be off
 _PLACE_PX = 3.0  # from where a marker should be
 _STRAY_MARKERS = 2  # that are read by mistake in other things
 _ALIKE = 0.15  # of a marker's side, and of a square's
 _MIN_SIDE = 64
-_TAG_POINTS = 4
 _WORKING_SIDES = (1920, 3840)  # [px]; photographs are reduced to the first, or the second if the print is small in them
 ACCURACY_PX = 0.05  # of points in a real photograph; lenses are not perfect
 _MAX_RMS_PX = 2.0
@@ -448,16 +440,16 @@ class Board:
         """Width and height [m]."""
         return self.columns * self.square_m, self.rows * self.square_m
 
-    def corners_m(self) -> Float[np.ndarray, "N 2"]:
-        """Where four squares meet, in the table frame [m]."""
+    def corners_m(self) -> Points:
+        """Return where four squares meet, in the table frame [m]."""
         return self._in_table_frame(np.asarray(self._charuco().getChessboardCorners()))
 
     def markers_m(self) -> Float[np.ndarray, "M 4 2"]:
-        """Corners of the markers by number, clockwise from the top left, in the table frame [m]."""
+        """Return the corners of the markers by number, clockwise from the top left, in the table frame [m]."""
         return self._in_table_frame(np.asarray(self._charuco().getObjPoints()))
 
     def image(self) -> Bool[np.ndarray, "h w"]:
-        """What is paper, not ink; 384 pixels a square."""
+        """Draw the board: what is paper, not ink; 384 pixels a square."""
         size = self.columns * SQUARE_PIXELS, self.rows * SQUARE_PIXELS
         return np.asarray(self._charuco().generateImage(size, marginSize=0)) > 0
 
@@ -472,36 +464,32 @@ class Board:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardView:
-    """What a photograph of a printed board or tag tells of its camera.
+    """The camera of a photograph of a printed board.
 
     Attributes:
         T_world_camera: pose of the camera in the table frame, whose origin is the print's centre.
         intrinsics: of the camera, 3 x 3 [px]; pixel centres at +0.5.
-        is_focal_estimated: whether the focal length was found from this photograph.
-        focal_std_px: its standard deviation [px]; 0 if it was given.
+        focal_std_px: standard deviation of a focal length found from this photograph [px]; 0 if it was given.
         reprojection_rms_px: root mean square distance of the points from where they should appear [px].
         points_m: that were found, on the table [m].
         points_px: where they were found in the photograph [px].
     """
 
     T_world_camera: Pose
-    intrinsics: Float[np.ndarray, "3 3"]
-    is_focal_estimated: bool
+    intrinsics: Intrinsics
     focal_std_px: float
     reprojection_rms_px: float
-    points_m: Float[np.ndarray, "N 2"]
-    points_px: Float[np.ndarray, "N 2"]
+    points_m: Points
+    points_px: Points
 
     @property
     def corner_count(self) -> int:
-        """How many points were found."""
+        """Number of points that were found."""
         return len(self.points_m)
 
 
-def locate_board(
-    image: UInt8[np.ndarray, "h w *channels"], board: Board, intrinsics: Float[np.ndarray, "3 3"] | None = None
-) -> BoardView:
-    """The camera of a photograph that shows a board.
+def locate_board(image: Image8, board: Board, intrinsics: Intrinsics | None = None) -> BoardView:
+    """Find the camera of a photograph that shows a board.
 
     Args:
         image: RGB or grey, as encoded by the camera, free of lens distortion.
@@ -510,64 +498,50 @@ def locate_board(
             image's middle.
 
     Raises:
-        InvalidInput: if the image is no photograph, no board or too little of it is found, the view is too steep to
-            tell the focal length, or the points do not fit the camera.
+        InvalidInput: if the image is no photograph, no board or too little of it is found, the view is too steep for
+            the focal length, or the points do not fit the camera.
     """
     found = board_points(image, board)
     return board_view(found, (image.shape[1], image.shape[0]), intrinsics)
 
 
-def board_points(image: UInt8[np.ndarray, "h w *channels"], board: Board) -> FoundPoints:
-    """Corners of the board's squares in a photograph.
+def board_points(image: Image8, board: Board) -> FoundPoints:
+    """Find the corners of the board's squares in a photograph.
 
     Raises:
         InvalidInput: if the image is no photograph, or no board or too little of it is found.
     """
-    grey = _grey(image)
-    found = _search_scales(grey, lambda small: _board_points(small, board), _MIN_CORNERS)
-    if len(found.points_m) < _MIN_CORNERS:
-        raise _not_found(grey, "board", len(found.points_m))
-    return found
+    grey, best = _grey(image), NOTHING
+    for side in _WORKING_SIDES:
+        small = _reduced(grey, side)
+        found = _board_points(small, board)
+        if len(found.points_m) > len(best.points_m):
+            best = FoundPoints(found.points_m, found.points_px * np.divide(grey.shape[::-1], small.shape[::-1]))
+        if len(best.points_m) >= _MIN_CORNERS or max(grey.shape) <= side:
+            break
+    if len(best.points_m) < _MIN_CORNERS:
+        raise _not_found(grey, len(best.points_m))
+    return best
 
 
-def board_view(
-    found: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"] | None = None
-) -> BoardView:
-    """The camera that fits points best, in a photograph of this width and height [px]; see `locate_board`."""
-    return _view(found, size, None if intrinsics is None else _checked_intrinsics(intrinsics))
+def board_view(found: FoundPoints, size: tuple[int, int], intrinsics: Intrinsics | None = None) -> BoardView:
+    """Fit the camera to points in a photograph of this width and height [px]; see `locate_board`."""
+    scale = px_scale(size)
+    if intrinsics is None:
+        focal, deviation = focal_length(found.points_m, found.points_px, size, ACCURACY_PX * scale)
+        K = camera_matrix(focal, size[0] / 2, size[1] / 2)
+    else:
+        K, deviation = _checked_intrinsics(intrinsics), 0.0
+    pose, rms = planar_pose(found.points_m, found.points_px, K)
+    if rms > _MAX_RMS_PX * scale:
+        raise InvalidInput(
+            "mean distance of the print's points from where this camera would show them [px]", round(rms, 1),
+            f"at most {_MAX_RMS_PX * scale:.1f}: check the intrinsics, and that the sheet lies flat",
+        )  # fmt: skip
+    return BoardView(pose, K, deviation, rms, found.points_m, found.points_px)
 
 
-def locate_tag(
-    image: UInt8[np.ndarray, "h w *channels"],
-    side_m: float,
-    intrinsics: Float[np.ndarray, "3 3"],
-    dictionary: str = TAG_DICTIONARY,
-) -> BoardView:
-    """The camera of a photograph that shows one AprilTag or ArUco marker, which lies flat on the table.
-
-    Its four points are the centres of the tag's quarters, the white around it included.
-
-    Args:
-        image: RGB or grey, as encoded by the camera, free of lens distortion.
-        side_m: of the tag's black border, without the white around it [m].
-        intrinsics: of the camera [px].
-        dictionary: which the tag comes from, one of OpenCV's.
-
-    Raises:
-        InvalidInput: if the image is no photograph, there is no such tag or more than one, or it does not fit the
-            camera.
-        UnknownName: if there is no such dictionary.
-    """
-    grey, given = _grey(image), _checked_intrinsics(intrinsics)
-    check_ranges(("side of the tag [m]", side_m, 0.005, 1.0))
-    known = marker_dictionary(dictionary)
-    found = _search_scales(grey, lambda small: _tag_points(small, known, side_m), _TAG_POINTS)
-    if len(found.points_m) < _TAG_POINTS:
-        raise _not_found(grey, "tag", 0)
-    return _view(found, grey.shape[::-1], given)
-
-
-def _grey(image: UInt8[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h w"]:
+def _grey(image: Image8) -> Grey:
     image = np.asarray(image)
     is_image = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
     if image.dtype != np.uint8 or not is_image or min(image.shape[:2]) < _MIN_SIDE:
@@ -576,134 +550,72 @@ def _grey(image: UInt8[np.ndarray, "h w *channels"]) -> UInt8[np.ndarray, "h w"]
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
 
 
-def _reduced(grey: UInt8[np.ndarray, "H W"], side: int) -> UInt8[np.ndarray, "h w"]:
-    """A copy whose longer side is at most this long [px]."""
+def _reduced(grey: Grey, side: int) -> Grey:
+    """Return a copy whose longer side is at most this long [px]."""
     scale = side / max(grey.shape)
     return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
 
 
-def _search_scales(
-    grey: UInt8[np.ndarray, "h w"], search: Callable[[UInt8[np.ndarray, "h w"]], FoundPoints], enough: int
-) -> FoundPoints:
-    """The most that is found in reduced copies of a photograph, in its own pixels; the first that is enough serves."""
-    best = NOTHING
-    for side in _WORKING_SIDES:
-        small = _reduced(grey, side)
-        found = search(small)
-        if len(found.points_m) > len(best.points_m):
-            best = FoundPoints(found.points_m, found.points_px * np.divide(grey.shape[::-1], small.shape[::-1]))
-        if len(best.points_m) >= enough or max(grey.shape) <= side:
-            break
-    return best
-
-
-def _board_points(grey: UInt8[np.ndarray, "h w"], board: Board) -> FoundPoints:
-    """Corners of a board; the patch around each is as large as a square."""
+def _board_points(grey: Grey, board: Board) -> FoundPoints:
+    """Find corners of a board; the patch around each is as large as a square."""
     markers_m = board.markers_m()
-    markers = find_markers(grey, marker_dictionary(board.dictionary))
-    read = [marker for marker in markers if marker.number < len(markers_m)]
-    if not read:
+    numbers, corners = find_markers(grey, marker_dictionary(board.dictionary))
+    own = numbers < len(markers_m)
+    if not own.any():
         return NOTHING
-    plane = np.concatenate([markers_m[marker.number] for marker in read])
-    guess, _ = cv2.findHomography(plane, np.concatenate([m.corners_px for m in read]), cv2.RANSAC, _GUESS_PX)
+    plane = markers_m[numbers[own]]
+    guess, _ = cv2.findHomography(plane.reshape(-1, 2), corners[own].reshape(-1, 2), cv2.RANSAC, _GUESS_PX)
     if guess is None:
         return NOTHING
     pattern = Pattern(board.image().astype(np.float32), board.size_m, board.corners_m(), board.square_m)
     found = find_points(grey, pattern, guess)
-    if len(found.points_m):
-        _check_layout(board, read, found)
-        _check_extent(board, [marker for marker in markers if marker.number >= len(markers_m)], found)
+    if len(found.points_m) and (_moved(plane, corners[own], found) or _continued(board, corners[~own], found)):
+        has = f"{board.columns} x {board.rows} squares with markers of {board.dictionary}"
+        raise InvalidInput("board in the photograph", "another one", f"the one that was told, which has {has}")
     return found
 
 
-def _check_extent(board: Board, others: list[Marker], found: FoundPoints) -> None:
-    """Refuse a board with more rows: markers that this one lacks continue its squares."""
+def _moved(plane: Float[np.ndarray, "M 4 2"], corners: Float[np.ndarray, "M 4 2"], found: FoundPoints) -> bool:
+    """Return whether markers lie elsewhere on the board: another layout's first squares look alike at a wrong scale."""
+    homography, _ = cv2.findHomography(found.points_m, found.points_px)
+    distances = np.abs(transform(homography, plane) - corners).max(axis=(1, 2))
+    in_place = int((distances < _PLACE_PX).sum())
+    return len(corners) - in_place > max(_STRAY_MARKERS, in_place / 3)
+
+
+def _continued(board: Board, corners: Float[np.ndarray, "M 4 2"], found: FoundPoints) -> bool:
+    """Return whether markers that this board lacks continue its squares: it has more rows."""
     homography, _ = cv2.findHomography(found.points_px, found.points_m)
-    corners = transform(homography, np.reshape([marker.corners_px for marker in others], (-1, 4, 2)))
+    corners = transform(homography, corners)
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     squares = (corners.mean(axis=1) + np.array(board.size_m) / 2) / board.square_m - 0.5  # whole in a square's middle
     continue_it = np.all(np.abs(sides / board.marker_m - 1) < _ALIKE, axis=1)
     continue_it &= np.all(np.abs(squares - np.round(squares)) < _ALIKE, axis=1)
-    if continue_it.sum() >= _STRAY_MARKERS:
-        raise _another_board(board)
+    return bool(continue_it.sum() >= _STRAY_MARKERS)
 
 
-def _another_board(board: Board) -> InvalidInput:
-    told = f"{board.columns} x {board.rows} squares with markers of {board.dictionary}"
-    return InvalidInput("board in the photograph", "another one", f"the one that was told, which has {told}")
-
-
-def _check_layout(board: Board, markers: list[Marker], found: FoundPoints) -> None:
-    """Refuse a board of another layout: its first squares look alike, and the scale would be wrong."""
-    homography, _ = cv2.findHomography(found.points_m, found.points_px)
-    expected = transform(homography, board.markers_m()[[marker.number for marker in markers]])
-    distances = np.abs(expected - [marker.corners_px for marker in markers]).max(axis=(1, 2))
-    in_place = int((distances < _PLACE_PX).sum())
-    if len(markers) - in_place > max(_STRAY_MARKERS, in_place / 3):
-        raise _another_board(board)
-
-
-def _tag_points(grey: UInt8[np.ndarray, "h w"], dictionary: cv2.aruco.Dictionary, side_m: float) -> FoundPoints:
-    """The centres of the quarters of the only tag."""
-    corners = (side_m * PATCH_CORNERS).astype(np.float32)
-    tags = []
-    for marker in find_markers(grey, dictionary):
-        guess = cv2.getPerspectiveTransform(corners, marker.corners_px.astype(np.float32))
-        found = find_points(grey, _tag_pattern(dictionary, marker.number, side_m), guess)
-        if len(found.points_m) == _TAG_POINTS:
-            tags.append(found)
-    if len(tags) > 1:
-        raise InvalidInput("number of tags in the photograph", len(tags), "1: cover the others")
-    return tags[0] if tags else NOTHING
-
-
-def _tag_pattern(dictionary: cv2.aruco.Dictionary, number: int, side_m: float) -> Pattern:
-    """A tag with the white around it, which is as wide as its border, and its quarters as patches."""
-    cells = dictionary.markerSize + 2
-    tag = cv2.aruco.generateImageMarker(dictionary, number, cells * _CELL_PIXELS)
-    image = np.pad(tag, _CELL_PIXELS, constant_values=255).astype(np.float32) / 255
-    whole_m = side_m * (cells + 2) / cells
-    return Pattern(image, (whole_m, whole_m), whole_m / 2 * PATCH_CORNERS, whole_m / 2)
-
-
-def _view(found: FoundPoints, size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"] | None) -> BoardView:
-    """The camera that fits points best, in a photograph of this width and height [px]."""
-    scale = max(1.0, max(size) / _WORKING_SIDES[0])
-    matrix, deviation = intrinsics, 0.0
-    if matrix is None:
-        focal, deviation = focal_length(found.points_m, found.points_px, size, ACCURACY_PX * scale)
-        matrix = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
-    pose, rms = planar_pose(found.points_m, found.points_px, matrix)
-    if rms > _MAX_RMS_PX * scale:
-        raise InvalidInput(
-            "mean distance of the print's points from where this camera would show them [px]", round(rms, 1),
-            f"at most {_MAX_RMS_PX * scale:.1f}: check the intrinsics, and that the sheet lies flat",
-        )  # fmt: skip
-    return BoardView(pose, matrix, intrinsics is None, deviation, rms, found.points_m, found.points_px)
-
-
-def _checked_intrinsics(intrinsics: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+def _checked_intrinsics(intrinsics: Intrinsics) -> Float[np.ndarray, "3 3"]:
     K = np.array(intrinsics, float)
     if K.shape != (3, 3) or not np.all(np.isfinite(K)) or not min(K[0, 0], K[1, 1]) > 0 or np.any(K[2] != (0, 0, 1)):
         raise InvalidInput("intrinsics", K.tolist(), "a 3 x 3 matrix with positive focal lengths and last row 0, 0, 1")
     return K
 
 
-def _not_found(grey: UInt8[np.ndarray, "h w"], what: str, corners: int) -> InvalidInput:
-    """Why a print was not found, as far as the photograph tells."""
+def _not_found(grey: Grey, corners: int) -> InvalidInput:
+    """Return why a print was probably not found."""
     if corners:
         allowed = f"at least {_MIN_CORNERS}: show all of it, with nothing lying on it"
-        return InvalidInput(f"number of corners of the {what} that were found", corners, allowed)
+        return InvalidInput("number of corners of the board that were found", corners, allowed)
     blur = _blur_px(_reduced(grey, _WORKING_SIDES[0]))
     if blur > _MAX_BLUR_PX:
-        allowed = f"at most {_MAX_BLUR_PX:g} for the {what} to be found: let the camera focus, and hold it still"
+        allowed = f"at most {_MAX_BLUR_PX:g} for the board to be found: let the camera focus, and hold it still"
         return InvalidInput("blur of the photograph's sharpest edges [px]", math.ceil(10 * blur) / 10, allowed)
     allowed = "whole in the picture, flat, evenly lit, within 1 m and seen from 25 degrees above the table or more"
-    return InvalidInput(f"{what} in the photograph", "not to be found", allowed)
+    return InvalidInput("board in the photograph", "not to be found", allowed)
 
 
-def _blur_px(grey: UInt8[np.ndarray, "h w"]) -> float:
-    """Standard deviation of the blur at the sharpest edges [px].
+def _blur_px(grey: Grey) -> float:
+    """Estimate the standard deviation of the blur at the sharpest edges [px].
 
     An edge of height H that is blurred by s has the slope H / (sqrt(2 pi) s). The photograph is smoothed by 1 px first,
     so that noise makes no edges.
@@ -725,7 +637,7 @@ _INCH_M = 0.0254
 
 
 def page_image(board: Board, pixels_per_m: float) -> Bool[np.ndarray, "h w"]:
-    """The page to print: the board in its middle, and below it a ruler and an instruction. True is paper.
+    """Draw the page to print: the board in its middle, and below it a ruler and an instruction. True is paper.
 
     Args:
         board: to print.
@@ -760,7 +672,7 @@ def _ruler_image(board: Board, size: tuple[int, int], pixels_per_m: float) -> Bo
 
 
 def board_pdf(board: Board) -> bytes:
-    """The page to print as PDF: A4, 600 dots an inch."""
+    """Return the page to print as PDF: A4, 600 dots an inch."""
     out = io.BytesIO()
     page = Image.fromarray(page_image(board, _PRINT_DPI / _INCH_M))
     page.save(out, "PDF", resolution=_PRINT_DPI, title="Calibration board", subject=f"{board}")

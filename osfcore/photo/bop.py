@@ -26,15 +26,15 @@ from osfcore.io.json_codec import Entry, Text, Vector3, Vector4, decode
 from osfcore.io.observation_file import MAX_CAMERAS
 from osfcore.photo.pose_loss import TablePrior
 from osfcore.photo.poses import table_from_objects
-from osfcore.photo.read_photograph import read_photograph
+from osfcore.photo.read_photograph import content_of, read_photograph
 
-# The numbers of YCB-Video's objects, and the frames in which other programs tell poses of YCB objects.
+# The numbers of YCB-Video's objects, and the frames in which other programs give poses of YCB objects.
 #
 # Three frames of one object are in use; they have the same axes, and differ in where the origin lies:
 #
 # - "bop": the centre of the mesh's bounding box, as in BOP's YCB-V, and here.
 # - "ycb_video": that of the models that came with YCB-Video (Xiang et al. 2018), of PoseCNN and its descendants: up
-#   to 3 cm away. BOP's notes on its YCB-V tell the shifts.
+#   to 3 cm away. BOP's notes on its YCB-V list the shifts.
 # - "google_16k": that of the meshes as YCB publishes them, in which the origin lies beside most objects.
 #
 # The bounding boxes of BOP's models and of the google_16k meshes agree along each axis within 0.3 mm, so that their
@@ -83,7 +83,7 @@ _SHIFTS_MM: dict[str, dict[str, _Shift]] = {
 
 
 def name_of(number: int) -> str:
-    """The object with a number, from 1 (002_master_chef_can) to 21 (061_foam_brick), of BOP's YCB-V and PoseCNN.
+    """Return the object with a number, from 1 (002_master_chef_can) to 21 (061_foam_brick), of BOP's YCB-V and PoseCNN.
 
     Raises:
         InvalidInput: if there is none.
@@ -94,7 +94,7 @@ def name_of(number: int) -> str:
 
 
 def in_object_frame(pose: Pose, name: str, frame: ModelFrame) -> Pose:
-    """`T_camera_object`, in the frame of the box's centre, of a pose in one of the other frames.
+    """Return `T_camera_object`, in the frame of the box's centre, of a pose in one of the other frames.
 
     Args:
         pose: from the model's frame to the camera's.
@@ -131,13 +131,13 @@ class _ModelJson(Entry):
 
 
 def read_centres(models: Path | None) -> Mapping[str, Float[np.ndarray, "3"]]:
-    """Box's centre in the model's frame, by name of the object [m].
+    """Read where the box's centre lies in each model's frame, by name of the object [m].
 
     Args:
         models: folder with models_info.json; None for BOP's YCB-V, whose models are centred.
 
     Raises:
-        CorruptFile: if there is none, or it is none.
+        CorruptFile: if the file is missing or broken.
     """
     if models is None:
         return dict.fromkeys(NAMES, np.zeros(3))
@@ -152,19 +152,22 @@ def read_centres(models: Path | None) -> Mapping[str, Float[np.ndarray, "3"]]:
 
 # Poses that another program found in a photograph, in the camera's frame.
 #
-# | file | what it is | positions | frame of the object | |---|---|---|---| | .csv | results of BOP:
-# scene_id,im_id,obj_id,score,R,t,time | mm | bop | | scene_gt.json | annotations of BOP: cam_R_m2c, cam_t_m2c,
-# obj_id by image | mm | bop | | .mat | results of PoseCNN: rois (column 1 is the class), poses (w, x, y, z, then
-# the position) | m | ycb_video | | .json | {"025_mug": {"position": [3], "quaternion": [w, x, y, z]}}, or that by
-# source, as in photo.json | m | bop |
+# | file          | what it is                                                                  | unit | frame     |
+# | .csv          | results of BOP: scene_id,im_id,obj_id,score,R,t,time                        | mm   | bop       |
+# | scene_gt.json | annotations of BOP: cam_R_m2c, cam_t_m2c, obj_id by image                   | mm   | bop       |
+# | .mat          | results of PoseCNN: rois (column 1 is the class), poses (w, x, y, z, then   | m    | ycb_video |
+# |               | the position)                                                               |      |           |
+# | .json         | {"025_mug": {"position": [3], "quaternion": [w, x, y, z]}}, or that by      | m    | bop       |
+# |               | source, as in photo.json                                                    |      |           |
 #
 # Objects of BOP and PoseCNN have YCB-Video's numbers.
 
 
 MAX_BYTES = 100_000_000
-_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t")
+HEADER = "scene_id,im_id,obj_id,score,R,t,time"
+SCENE_CAMERA, SCENE_GT = "scene_camera.json", "scene_gt.json"
+_MOST_SKEW = 0.02  # of R R^T from the identity
 _NEAR_M, _FAR_M = 0.02, 20.0  # where objects can be before a camera
-_QUATERNION = 4
 _KINDS = "a .csv of BOP, a scene_gt.json, a .mat of PoseCNN, or a .json with a position and a quaternion of each object"
 
 
@@ -208,14 +211,14 @@ class _Row:
 
 
 def read_poses(path: Path, choice: PoseChoice | None = None) -> dict[str, Pose]:
-    """`T_camera_object` by name, objects in the frame of their box's centre; of several the one with the best score.
+    """Read `T_camera_object` by name, to the centre of the object's box; of several poses the one with the best score.
 
     Args:
         path: of the file, in one of the forms above.
         choice: which of its poses.
 
     Raises:
-        CorruptFile: if it is none of these, or a pose in it is none.
+        CorruptFile: if it is none of these, or a pose in it makes no sense.
         InvalidInput: if it holds several images, scenes or sources and the choice leaves it open, or lacks the chosen.
         UnknownName: if an object's origin is not known in the frame.
     """
@@ -233,7 +236,7 @@ def read_poses(path: Path, choice: PoseChoice | None = None) -> dict[str, Pose]:
 
 
 def scene_gt_names(path: Path, image: int) -> tuple[str, ...]:
-    """Objects of an image in a scene_gt.json, in the order by which BOP numbers its masks.
+    """Read the objects of an image from a scene_gt.json, in the order by which BOP numbers its masks.
 
     Raises:
         CorruptFile: if it is no scene_gt.json.
@@ -243,10 +246,10 @@ def scene_gt_names(path: Path, image: int) -> tuple[str, ...]:
 
 
 def result_images(path: Path) -> dict[tuple[int, int], list[str]]:
-    """Objects by scene and image in results of BOP (.csv).
+    """Read the objects by scene and image from results of BOP (.csv).
 
     Raises:
-        CorruptFile: if the file is none, or a pose in it is none.
+        CorruptFile: if the file is broken.
     """
     found: dict[tuple[int, int], list[str]] = {}
     for row in _csv_rows(path):
@@ -255,30 +258,30 @@ def result_images(path: Path) -> dict[tuple[int, int], list[str]]:
 
 
 def _of_image(rows: list[_Row], choice: PoseChoice) -> dict[str, Pose]:
-    scene = _only("scene", choice.scene, {row.scene for row in rows})
+    scene = _only("scene of the poses", choice.scene, {row.scene for row in rows})
     rows = [row for row in rows if row.scene == scene]
-    image = _only("image", choice.image, {row.image for row in rows})
+    image = _only("image of the poses", choice.image, {row.image for row in rows})
     chosen = sorted((row for row in rows if row.image == image), key=lambda row: row.score)
     return {row.name: row.pose for row in chosen}  # the best comes last
 
 
 def _only(what: str, asked: int | str | None, there: set[int] | set[str]) -> Any:  # noqa: ANN401
-    """What is asked for, or the only one there is."""
+    """Return what is asked for, or the only one there is."""
     if asked is None and len(there) == 1:
         return next(iter(there))
     if asked not in there:
         some = shown(", ".join(str(one) for one in sorted(there)))
-        raise InvalidInput(f"{what} of the poses", "not told" if asked is None else asked, f"one of {some or 'none'}")
+        raise InvalidInput(what, "not told" if asked is None else asked, f"one of {some or 'none'}")
     return asked
 
 
 def _csv_rows(path: Path) -> list[_Row]:
-    text = _content(path).decode("utf-8-sig", errors="replace").replace("\0", "?")
+    text = content_of(path, shown(path), MAX_BYTES).decode("utf-8-sig", errors="replace").replace("\0", "?")
     try:
         lines = [line for line in csv.reader(io.StringIO(text)) if line]
     except csv.Error:
         raise CorruptFile(shown(path), "it is no table of values with commas between them") from None
-    if lines and lines[0][0].strip() == _COLUMNS[0]:
+    if lines and lines[0][0].strip() == "scene_id":
         lines = lines[1:]
     if not lines:
         raise CorruptFile(shown(path), "it holds no poses")
@@ -291,13 +294,13 @@ def _csv_rows(path: Path) -> list[_Row]:
         except OsfError as error:
             raise CorruptFile(shown(path), f"pose {number}: {str(error).rstrip('.')}") from None
         except (ValueError, IndexError):
-            expected = f"{','.join(_COLUMNS)},time with 9 numbers for R and 3 for t"
-            raise CorruptFile(shown(path), f"pose {number} is not {expected}, separated by spaces") from None
+            expected = f"{HEADER} with 9 numbers for R and 3 for t, separated by spaces"
+            raise CorruptFile(shown(path), f"pose {number} is not {expected}") from None
     return rows
 
 
 def _gt_rows(data: object) -> list[_Row]:
-    """Rows of a scene_gt.json; those of one image in its order."""
+    """Return the rows of a scene_gt.json; those of one image in its order."""
     by_image = decode(dict[str, list[_BopJson]], data, "scene_gt")
     return [
         _Row(0, int(image), name_of(entry.obj_id), 0.0, _bop_pose(np.array(entry.rotation), np.array(entry.position)))
@@ -312,7 +315,7 @@ def _of_json(path: Path, choice: PoseChoice) -> dict[str, Pose]:
             return _gt_rows(data)
         if isinstance(data, dict) and "poses_camera_object" in data:
             by_source = decode(dict[Text, dict[Text, _PoseJson]], data["poses_camera_object"], "poses_camera_object")
-            entries: Mapping[str, _PoseJson] = by_source[_only("source", choice.source, set(by_source))]
+            entries: Mapping[str, _PoseJson] = by_source[_only("source of the poses", choice.source, set(by_source))]
         else:
             entries = decode(dict[Text, _PoseJson], data, "poses")
         return {name: _pose(entry.quaternion, entry.position, name) for name, entry in entries.items()}
@@ -322,7 +325,7 @@ def _of_json(path: Path, choice: PoseChoice) -> dict[str, Pose]:
 
 
 def _of_mat(path: Path, variable: str) -> dict[str, Pose]:
-    content = _content(path)
+    content = content_of(path, shown(path), MAX_BYTES)
     try:
         data = loadmat(io.BytesIO(content))
         classes, poses = np.atleast_2d(data["rois"])[:, 1].astype(int), np.atleast_2d(data[variable]).astype(float)
@@ -334,30 +337,33 @@ def _of_mat(path: Path, variable: str) -> dict[str, Pose]:
     if poses.shape != (len(classes), 7):
         raise CorruptFile(shown(path), f"its {variable} are not 7 numbers for each of its {len(classes)} rois")
     order = np.argsort(scores[:, 0], kind="stable") if scores.shape[1] else np.arange(len(classes))[::-1]
-    seen = [k for k in order if np.any(poses[k, :_QUATERNION])]  # zeros stand for what was not found
-    return dict(_named(path, int(classes[k]), poses[k]) for k in seen)
-
-
-def _named(path: Path, number: int, values: np.ndarray) -> tuple[str, Pose]:
-    try:
-        name = name_of(number)
-        return name, _pose(values[:_QUATERNION], values[_QUATERNION:], name)
-    except OsfError as error:
-        raise CorruptFile(shown(path), str(error).rstrip(".")) from None
+    found = {}
+    for k in order:
+        if np.any(poses[k, :4]):  # zeros stand for what was not found
+            try:
+                name = name_of(int(classes[k]))
+                found[name] = _pose(poses[k, :4], poses[k, 4:], name)
+            except OsfError as error:
+                raise CorruptFile(shown(path), str(error).rstrip(".")) from None
+    return found
 
 
 def _bop_pose(rotation: np.ndarray, shift_mm: np.ndarray) -> Pose:
-    """The pose of a rotation matrix, row by row, and a position in mm."""
+    """Return the pose of a rotation matrix, row by row, and a position in mm."""
     if rotation.shape != (9,) or shift_mm.shape != (3,):
-        raise InvalidInput(
-            "pose", f"{rotation.size} and {shift_mm.size} numbers", "9 for the rotation and 3 for the position"
-        )
-    matrix = rotation.reshape(3, 3)
+        given = f"{rotation.size} and {shift_mm.size} numbers"
+        raise InvalidInput("pose", given, "9 for the rotation and 3 for the position")
+    quaternion = _nearest_rotation(rotation.reshape(3, 3), "rotation")
+    return Pose(_before_camera(1e-3 * shift_mm, "mm"), quaternion)
+
+
+def _nearest_rotation(matrix: Float[np.ndarray, "3 3"], what: str) -> Float[np.ndarray, "4"]:
+    """Return the unit quaternion of the rotation next to a matrix, which must be one but for rounding."""
     bounded = np.all(np.abs(matrix) < 1 + _MOST_SKEW)  # false for NaN
     if not bounded or np.abs(matrix @ matrix.T - np.eye(3)).max() > _MOST_SKEW or np.linalg.det(matrix) < 0:
-        raise InvalidInput("rotation", matrix.round(3).tolist(), "a rotation matrix, row by row")
+        raise InvalidInput(what, matrix.round(3).tolist(), "a rotation matrix, row by row")
     left, _, right = np.linalg.svd(matrix)
-    return Pose(_before_camera(1e-3 * shift_mm, "mm"), quaternion_from_matrix(left @ right))
+    return quaternion_from_matrix(left @ right)
 
 
 def _pose(quaternion: Any, position: Any, name: str) -> Pose:  # noqa: ANN401
@@ -372,26 +378,16 @@ def _before_camera(position: np.ndarray, unit: str) -> np.ndarray:
     return position
 
 
-def _content(path: Path) -> bytes:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise CorruptFile(shown(path), f"it is larger than {MAX_BYTES // 1_000_000} MB")
-        return path.read_bytes()
-    except OSError as error:
-        raise CorruptFile(shown(path), error.strerror or str(error)) from error
-
-
 # Poses as the results of BOP: what its toolkit evaluates.
 #
 #     scene_id,im_id,obj_id,score,R,t,time
 #
 # R are 9 numbers, row by row, t 3 in mm, separated by spaces: x_camera = R x_model + t in the frame of BOP's model.
 # Objects here have their origin at the centre of their bounding box; BOP's models of YCB-V have theirs there, too,
-# and where the folder of other models is given, models_info.json tells where the centre lies. `time` is that of the
+# and where the folder of other models is given, models_info.json says where the centre lies. `time` is that of the
 # whole image [s], -1 where it is not known.
 
 
-HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 UNKNOWN_TIME = -1.0
 _MOST_SCENE = 999_999
 
@@ -403,7 +399,7 @@ def bop_results(
     models: Path | None = None,
     seconds: float = UNKNOWN_TIME,
 ) -> str:
-    """Every object of a state in every image, as a CSV.
+    """Write every object of a state in every image as a CSV.
 
     The score is 1 / (1 + standard deviation of the position [mm]): 1 for a state that says nothing of it, 0 for one
     without bounds. BOP ranks by it.
@@ -431,33 +427,26 @@ def bop_results(
             if name not in centres:
                 raise UnknownName("object of BOP's YCB-V", name, centres)
             pose = T_camera_world @ estimate.state.pose(name)
-            lines.append(
-                f"{scene},{int(camera.name)},{NAMES.index(name) + 1},{1 / (1 + 1e3 * std):.6g},"
-                f"{_in_model_frame(pose, centres[name])},{seconds:g}"
-            )
+            parts = quaternion_to_matrix(pose.quaternion).ravel(), 1e3 * pose.apply(-centres[name])
+            R, t = (" ".join(f"{value:.8f}" for value in part) for part in parts)
+            score = f"{1 / (1 + 1e3 * std):.6g}"
+            lines.append(f"{scene},{int(camera.name)},{NAMES.index(name) + 1},{score},{R},{t},{seconds:g}")
     return "\n".join(lines) + "\n"
-
-
-def _in_model_frame(pose: Pose, centre: np.ndarray) -> str:
-    """R and t [mm] from the model's frame to the camera's, of `T_camera_object`."""
-    numbers = quaternion_to_matrix(pose.quaternion).ravel(), 1e3 * pose.apply(-centre)
-    return ",".join(" ".join(f"{value:.8f}" for value in part) for part in numbers)
 
 
 # Masks that another program or a person drew: a folder of PNG files, by name of the object or as BOP numbers them.
 #
-# NAME.png or mask_NAME.png what is brighter than half of the brightest is the object IMAGE_INDEX.png
-# (000059_000002.png) BOP's mask_visib; INDEX counts the objects of IMAGE in scene_gt.json beside it
+# NAME.png or mask_NAME.png: what is brighter than half of the brightest pixel is the object.
+# IMAGE_INDEX.png (000059_000002.png): BOP's mask_visib; INDEX counts the objects of IMAGE in scene_gt.json beside it.
 
 
 _BOP_NAME = re.compile(r"(\d{6})_(\d{6})\.png")
-_SCENE_GT = "scene_gt.json"
 
 
 def read_masks(
     folder: Path, known: Collection[str], sizes: tuple[tuple[int, int], tuple[int, int]], image: int | None = None
 ) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Masks by name of the object; files of others are left alone, and so are masks without a pixel.
+    """Read masks by name of the object; files of others are left alone, and so are masks without a pixel.
 
     Args:
         folder: that holds them.
@@ -484,19 +473,14 @@ def read_masks(
 
 
 def _bop_files(folder: Path, image: int | None) -> dict[str, Path]:
-    """Files as BOP numbers them, by object; none if there are none."""
+    """Return the files that are numbered as BOP does, by object."""
     numbered = [match for path in folder.iterdir() if (match := _BOP_NAME.fullmatch(path.name))]
     if not numbered:
         return {}
-    images = sorted({int(match[1]) for match in numbered})
-    if image is None and len(images) == 1:
-        image = images[0]
-    if image not in images:
-        given = "not told" if image is None else image
-        raise InvalidInput("image of the masks", given, f"one of {shown(', '.join(map(str, images)))}")
-    table = next((f / _SCENE_GT for f in (folder, folder.parent) if (f / _SCENE_GT).is_file()), None)
+    image = _only("image of the masks", image, {int(match[1]) for match in numbered})
+    table = next((place / SCENE_GT for place in (folder, folder.parent) if (place / SCENE_GT).is_file()), None)
     if table is None:
-        raise InvalidInput(f"{_SCENE_GT} of the masks", "missing", "in the folder above them: it tells what they show")
+        raise InvalidInput(f"{SCENE_GT} of the masks", "missing", "in the folder above them: it tells what they show")
     names = scene_gt_names(table, image)
     its = {int(match[2]): folder / match[0] for match in numbered if int(match[1]) == image}
     return {name: its[index] for index, name in enumerate(names) if index in its}
@@ -519,19 +503,18 @@ def _read(path: Path, sent: tuple[int, int], kept: tuple[int, int]) -> Bool[np.n
 
 # Images of a scene of a BOP data set, each with its camera, masks and annotated poses in the camera's own frame.
 #
-# FOLDER (its name is the scene's number) scene_camera.json {"IMAGE": {"cam_K": [9], "cam_R_w2c": [9], "cam_t_w2c":
-# [3]}}, mm scene_gt.json {"IMAGE": [{"obj_id", "cam_R_m2c", "cam_t_m2c"}]}, mm rgb/IMAGE.png or .jpg with six
-# digits mask_visib/IMAGE_INDEX.png
+# FOLDER (its name is the scene's number)
+#   scene_camera.json {"IMAGE": {"cam_K": [9], "cam_R_w2c": [9], "cam_t_w2c": [3]}}, mm
+#   scene_gt.json {"IMAGE": [{"obj_id", "cam_R_m2c", "cam_t_m2c"}]}, mm
+#   rgb/IMAGE.png or .jpg with six digits
+#   mask_visib/IMAGE_INDEX.png
 #
 # What is assumed: objects have the numbers of YCB-V, and each is there once. BOP counts pixels from the centre of
 # the first one, which is at (0.5, 0.5) here, so that half a pixel is added to its principal points.
 
 
-SCENE_CAMERA, SCENE_GT = "scene_camera.json", "scene_gt.json"
-_MASKS = "mask_visib"
 _HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0.0]])
 _FARTHEST_M = 20.0
-_MOST_SKEW = 0.02  # of R R^T from the identity
 
 
 class _CameraJson(Entry):
@@ -541,30 +524,24 @@ class _CameraJson(Entry):
     R_w2c: list[FiniteFloat] | None = Field(default=None, alias="cam_R_w2c", min_length=9, max_length=9)
     t_w2c: Vector3 | None = Field(default=None, alias="cam_t_w2c")
 
-    def intrinsics(self) -> Float[np.ndarray, "3 3"]:
-        """K for pixel centres at +0.5 [px]."""
-        return np.array(self.K).reshape(3, 3) + _HALF_PIXEL
-
     def T_camera_world(self, image: int) -> Pose | None:  # noqa: N802
-        """From BOP's world to the camera [m]; None where the file does not tell.
+        """Return the pose of BOP's world in the camera's frame [m]; None where the file lacks it.
 
         Raises:
             InvalidInput: if it is no rotation, or farther away than any table.
         """
         if self.R_w2c is None or self.t_w2c is None:
             return None
-        R, t = np.array(self.R_w2c).reshape(3, 3), 1e-3 * np.array(self.t_w2c)
-        if np.abs(R @ R.T - np.eye(3)).max() > _MOST_SKEW or np.linalg.det(R) < 0:
-            raise InvalidInput(f"cam_R_w2c of image {image}", R.round(3).tolist(), "a rotation matrix, row by row")
+        quaternion = _nearest_rotation(np.array(self.R_w2c).reshape(3, 3), f"cam_R_w2c of image {image}")
+        t = 1e-3 * np.array(self.t_w2c)
         if np.linalg.norm(t) > _FARTHEST_M:
             raise InvalidInput(f"cam_t_w2c of image {image} [mm]", self.t_w2c, f"below {1e3 * _FARTHEST_M:g} in length")
-        left, _, right = np.linalg.svd(R)
-        return Pose(t, quaternion_from_matrix(left @ right))
+        return Pose(t, quaternion)
 
 
 @dataclass(frozen=True, slots=True)
 class BopChoice:
-    """What of a scene is meant.
+    """Which images of a scene are read, and how.
 
     Attributes:
         images: their numbers; None for all, spread evenly if there are more than an observation holds.
@@ -587,7 +564,7 @@ class BopImage:
         picture: linear RGB in [0, 1].
         masks: visible pixels, of objects that have some.
         poses: annotated, `T_camera_object` to the centre of the box.
-        T_camera_world: from BOP's world; None where that is not told.
+        T_camera_world: from BOP's world; None where that is unknown.
     """
 
     number: int
@@ -599,7 +576,7 @@ class BopImage:
 
 
 def is_bop_scene(path: Path) -> bool:
-    """Whether a path is a folder with BOP's files in it."""
+    """Return whether a path is a folder with BOP's files in it."""
     return (path / SCENE_CAMERA).is_file() or (path / SCENE_GT).is_file()
 
 
@@ -614,16 +591,6 @@ def read_images(folder: Path, choice: BopChoice | None = None) -> tuple[BopImage
         CorruptFile: if a file is missing or broken, or a mask has another size than its picture.
         InvalidInput: if an image is chosen that is not there, or an object is there several times.
     """
-    choice = choice or BopChoice()
-    entries, centres = _read_cameras(folder), read_centres(choice.models)
-    return tuple(
-        _image(folder, number, entries[number], _annotated(folder, number, centres), choice.encoding)
-        for number in _chosen(choice.images, tuple(entries))
-    )
-
-
-def _read_cameras(folder: Path) -> dict[int, _CameraJson]:
-    """Cameras by number of the image."""
 
     def parse(data: object) -> dict[int, _CameraJson]:
         entries = decode(dict[str, _CameraJson], data, SCENE_CAMERA)
@@ -631,7 +598,12 @@ def _read_cameras(folder: Path) -> dict[int, _CameraJson]:
             raise InvalidInput("images", shown(list(entries)), "numbered, at least one")
         return {int(number): entry for number, entry in entries.items()}
 
-    return read_json(folder / SCENE_CAMERA, parse)
+    choice = choice or BopChoice()
+    entries, centres = read_json(folder / SCENE_CAMERA, parse), read_centres(choice.models)
+    return tuple(
+        _image(folder, number, entries[number], _annotated(folder, number, centres), choice.encoding)
+        for number in _chosen(choice.images, tuple(entries))
+    )
 
 
 def _chosen(asked: tuple[int, ...] | None, there: tuple[int, ...]) -> tuple[int, ...]:
@@ -646,7 +618,7 @@ def _chosen(asked: tuple[int, ...] | None, there: tuple[int, ...]) -> tuple[int,
 
 
 def _annotated(folder: Path, image: int, centres: Mapping[str, np.ndarray]) -> dict[str, Pose]:
-    """`T_camera_object` of the objects in an image, in the frame of their boxes' centres."""
+    """Read `T_camera_object` of the objects in an image, in the frame of their boxes' centres."""
     names = scene_gt_names(folder / SCENE_GT, image)
     if repeated := [name for name in names if names.count(name) > 1]:
         raise InvalidInput(f"objects of image {image}", f"{repeated[0]} several times", "each there once")
@@ -659,17 +631,21 @@ def _annotated(folder: Path, image: int, centres: Mapping[str, np.ndarray]) -> d
 
 
 def _image(folder: Path, number: int, entry: _CameraJson, poses: Mapping[str, Pose], encoding: Encoding) -> BopImage:
-    """An image with what belongs to it, reduced to the largest size of cameras."""
-    raw = read_photograph(_picture_of(folder, number), encoding=encoding)
+    """Read an image with what belongs to it, reduced to the largest size of cameras."""
+    png, jpg = (folder / "rgb" / f"{number:06d}{suffix}" for suffix in (".png", ".jpg"))
+    picture_file = next((path for path in (png, jpg) if path.is_file()), None)
+    if picture_file is None:
+        raise CorruptFile(png, "there is no such picture, nor a .jpg")
+    raw = read_photograph(picture_file, encoding=encoding)
     width, height = raw.sent_size
     scale = min(1.0, MAX_IMAGE_SIDE / max(width, height))
     size = round(width * scale), round(height * scale)
-    K = np.diag([size[0] / width, size[1] / height, 1.0]) @ entry.intrinsics()
+    K = np.diag([size[0] / width, size[1] / height, 1.0]) @ (np.array(entry.K).reshape(3, 3) + _HALF_PIXEL)
     masks: Mapping[str, np.ndarray] = {}
     try:
         camera, T_camera_world = Camera(str(number), Pose.identity(), K, *size), entry.T_camera_world(number)
         if poses:
-            masks = read_masks(folder / _MASKS, poses, (raw.sent_size, size), number)
+            masks = read_masks(folder / "mask_visib", poses, (raw.sent_size, size), number)
     except CorruptFile:
         raise
     except OsfError as error:
@@ -680,27 +656,19 @@ def _image(folder: Path, number: int, entry: _CameraJson, poses: Mapping[str, Po
     return BopImage(number, camera, np.clip(picture, 0, 1), masks, poses, T_camera_world)
 
 
-def _picture_of(folder: Path, image: int) -> Path:
-    for suffix in (".png", ".jpg"):
-        path = folder / "rgb" / f"{image:06d}{suffix}"
-        if path.is_file():
-            return path
-    raise CorruptFile(folder / "rgb" / f"{image:06d}.png", "there is no such picture, nor a .jpg")
-
-
 # A scene of a BOP data set as an observation over a table, and the annotated poses beside it.
 #
 # BOP's world can be any frame: it counts as the table's (z up, table at z = 0) only if cameras are above it and
-# objects near it, and else can be replaced by the table that the objects tell.
+# objects near it, and else can be replaced by the table on which the objects lie.
 
 
 _HIGHEST_M, _DEEPEST_M, _WIDEST_M = 1.0, 0.05, 1.5  # where objects on a table can be
-_HOW = "'osf import bop --table objects' finds the table by how the objects lie"
+_HOW_TO_FIND = "'osf import bop --table objects' finds the table by how the objects lie"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BopScene:
-    """A scene as it is understood.
+    """A scene over a table.
 
     Attributes:
         observation: cameras bear the numbers of their images.
@@ -731,12 +699,15 @@ def read_bop_scene(
 
     Raises:
         CorruptFile: if a file is missing or broken.
-        InvalidInput: if images or objects are chosen that are not there, the cameras' places are not told, or BOP's
+        InvalidInput: if images or objects are chosen that are not there, the cameras' places are missing, or BOP's
             world is not the table's frame.
     """
     images = read_images(folder, choice)
     there = tuple(sorted({name for image in images for name in image.poses}))
-    names = _names(names, there, known)
+    if names is None:
+        names = tuple(name for name in there if known is None or name in known)
+    elif missing := [name for name in names if name not in there]:
+        raise InvalidInput("object", missing[0], f"one that scene_gt.json has: {', '.join(there) or 'none'}")
     cameras = _in_bop_world(images) if table_prior is None else _over_found_table(images, table_prior, known)
     poses = {
         name: next(c @ i.poses[name] for c, i in zip(cameras, images, strict=True) if name in i.poses) for name in names
@@ -757,20 +728,12 @@ def read_bop_scene(
     return BopScene(observation, poses, tuple(name for name in there if name not in names))
 
 
-def _names(asked: tuple[str, ...] | None, there: tuple[str, ...], known: Collection[str] | None) -> tuple[str, ...]:
-    if asked is None:
-        return tuple(name for name in there if known is None or name in known)
-    if missing := [name for name in asked if name not in there]:
-        raise InvalidInput("object", missing[0], f"one that scene_gt.json has: {', '.join(there) or 'none'}")
-    return asked
-
-
 def _in_bop_world(images: Sequence[BopImage]) -> list[Pose]:
-    """`T_world_camera` of each image."""
+    """Return `T_world_camera` of each image."""
     poses: list[Pose] = []
     for image in images:
         if image.T_camera_world is None:
-            raise InvalidInput(f"cam_R_w2c and cam_t_w2c of image {image.number}", "missing", f"given; {_HOW}")
+            raise InvalidInput(f"cam_R_w2c and cam_t_w2c of image {image.number}", "missing", f"given; {_HOW_TO_FIND}")
         poses.append(image.T_camera_world.inverse())
     return poses
 
@@ -778,7 +741,7 @@ def _in_bop_world(images: Sequence[BopImage]) -> list[Pose]:
 def _over_found_table(
     images: Sequence[BopImage], table_prior: Callable[[str], TablePrior], known: Collection[str] | None
 ) -> list[Pose]:
-    """`T_world_camera` of each image over the table on which the objects of the first one lie."""
+    """Return `T_world_camera` of each image over the table on which the objects of the first one lie."""
     lost = [image.number for image in images if image.T_camera_world is None]
     if lost and len(images) > 1:
         what = f"cam_R_w2c and cam_t_w2c of image {lost[0]}"
@@ -794,8 +757,8 @@ def _over_found_table(
 
 
 def _check_over_table(images: Sequence[BopImage], cameras: Sequence[Pose], poses: Mapping[str, Pose]) -> None:
-    """Cameras above z = 0, objects near it; a world that is one of the cameras fails."""
-    why = f"{SCENE_CAMERA} seems to mean another world or unit than mm: {_HOW}"
+    """Refuse cameras below z = 0 and objects far from it, as in a world that is one of the cameras."""
+    why = f"{SCENE_CAMERA} seems to mean another world or unit than mm: {_HOW_TO_FIND}"
     for image, camera in zip(images, cameras, strict=True):
         height = camera.position[2]
         if not height > _DEEPEST_M:

@@ -20,9 +20,15 @@ from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_from_matrix,
 from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, decode, encode
-from osfcore.photo.board import ACCURACY_PX, Board, calibrated, planar_pose
+from osfcore.photo.board import ACCURACY_PX, Board, Points, camera_matrix, fit_focal, on_plane, planar_pose, px_scale
 from osfcore.photo.lens import FINE_PX, Lens, board_points_through_lens
 from osfcore.photo.read_photograph import RawPhotograph
+
+Points3 = Float[np.ndarray, "N 3"]
+Theta = Float[np.ndarray, "4"]  # log f, cx, cy [px] and k1
+PoseVector = Float[np.ndarray, "6"]  # rotation vector [rad] and translation [m]
+ThetaMatrix = Float[np.ndarray, "4 4"]
+JointMatrix = Float[np.ndarray, "10 10"]  # over theta and a pose
 
 # The board in one photograph, as the calibration of a camera takes it.
 
@@ -40,23 +46,22 @@ class Sighting:
 
     name: str
     size: tuple[int, int]
-    points_m: Float[np.ndarray, "N 2"]
-    points_px: Float[np.ndarray, "N 2"]
+    points_m: Points
+    points_px: Points
 
 
-def sight(raw: RawPhotograph, name: str, board: Board | None = None) -> Sighting:
-    """Look for the board in a photograph.
+def sight(raw: RawPhotograph, name: str) -> Sighting:
+    """Find the board's corners in a photograph.
 
     Args:
         raw: the decoded photograph.
         name: of the photograph, for people.
-        board: that was printed; the default one if not given.
 
     Raises:
         CorruptFile: naming the photograph, if no board or too little of it is found, and why.
     """
     try:
-        found, lens = board_points_through_lens(raw.eight_bit, board or Board())
+        found, lens = board_points_through_lens(raw.eight_bit, Board())
     except InvalidInput as error:
         raise CorruptFile(shown(name), str(error).rstrip(".")) from None
     points = found.points_px if lens is None else lens.bent(found.points_px)
@@ -74,15 +79,11 @@ def sight(raw: RawPhotograph, name: str, board: Board | None = None) -> Sighting
 INTRINSICS, POSE = 4, 6  # numbers of parameters
 # Corners are off by 0.05 px, but alike in all of a photograph: on the table that counts as much as independent 0.1 px.
 LEAST_NOISE_PX = 0.1
-_USUAL_SIDE = 1920  # [px]; in larger photographs corners scatter by more pixels
-_TOLD = 0.2  # relative deviation of a focal length to begin with
+_MOST_FIRST_STD = 0.2  # relative, of a focal length to begin with
 _MOST_STEPS = 200
 _FARTHEST = 3.0  # of log f from where it began
 _SAME_POSE = 0.01  # [rad, m]
 _LOOSE = (1.0, 0.5, 0.5, 1.0)  # deviations of log f, of the principal point in longer sides, of k1; see `_descend`
-
-Theta = Float[np.ndarray, "4"]
-PoseVector = Float[np.ndarray, "6"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -105,48 +106,35 @@ class CameraFit:
 
     @property
     def lens(self) -> Lens:
-        """The camera as photographs take it."""
+        """The same camera as a lens."""
         return Lens(matrix(self.theta), float(self.theta[3]))
 
 
-def px_scale(size: tuple[int, int]) -> float:
-    """How many times more pixels errors may have in a photograph of this size than in a small one."""
-    return max(1.0, max(size) / _USUAL_SIDE)
-
-
 def matrix(theta: Theta) -> Float[np.ndarray, "3 3"]:
-    """K [px]."""
-    f = np.exp(theta[0])
-    return np.array([[f, 0, theta[1]], [0, f, theta[2]], [0, 0, 1]])
+    """Return K [px]."""
+    return camera_matrix(np.exp(theta[0]), theta[1], theta[2])
 
 
-def seen(
-    theta: Theta, pose: PoseVector, points: Float[np.ndarray, "N 3"]
-) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2 10"]]:
-    """Where points appear [px], and the derivative by theta and pose."""
+def seen(theta: Theta, pose: PoseVector, points: Points3) -> tuple[Points, Float[np.ndarray, "N 2 10"]]:
+    """Project points of the board's frame [px], with the derivatives by theta and pose."""
     bend = np.array([theta[3], 0.0, 0.0, 0.0])
     pixels, by = cv2.projectPoints(points, pose[:3], pose[3:], matrix(theta), bend)
     by_log_f = np.exp(theta[0]) * (by[:, 6] + by[:, 7])
     return pixels.reshape(-1, 2), np.column_stack([by_log_f, by[:, 8:11], by[:, :6]]).reshape(-1, 2, INTRINSICS + POSE)
 
 
-def on_board(points_m: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    """Points of the board's plane in its frame [m]."""
-    return np.pad(points_m, ((0, 0), (0, 1)))
-
-
 def pose_of(vector: PoseVector) -> Pose:
-    """`T_camera_board` of a rotation vector and a translation."""
+    """Return `T_camera_board` of a rotation vector and a translation."""
     return Pose(vector[3:].copy(), quaternion_from_matrix(cv2.Rodrigues(vector[:3])[0]))
 
 
 def vector_of(T_camera_board: Pose) -> PoseVector:
-    """The inverse of `pose_of`."""
+    """Return the rotation vector and the translation of a pose: the inverse of `pose_of`."""
     return np.concatenate([quaternion_log(T_camera_board.quaternion), T_camera_board.position])
 
 
 def fit_camera(views: Sequence[Sighting]) -> CameraFit:
-    """The camera that minimises the squared distances of all corners from where they should appear.
+    """Find the camera that minimises the squared distances of all corners from where they should appear.
 
     A plane seen from afar fits two poses almost equally well, and which is right may turn out only once the focal
     length is known: poses are begun anew from the first solution, and the better of the two solutions is taken.
@@ -158,7 +146,9 @@ def fit_camera(views: Sequence[Sighting]) -> CameraFit:
         CorruptFile: naming a photograph that shows the board's back.
     """
     size = views[0].size
-    focal = _first_focal(views)
+    fits = [fit_focal(view.points_m, view.points_px, size, ACCURACY_PX * px_scale(size)) for view in views]
+    focals = [fit.focal for fit in fits if fit is not None and fit.focal_std < _MOST_FIRST_STD * fit.focal]
+    focal = float(np.median(focals)) if focals else float(max(size))
     theta = np.array([np.log(focal), size[0] / 2, size[1] / 2, 0.0])
     first = _descend(views, theta, _poses(views, theta))
     theta, poses = _split(first.x)
@@ -174,16 +164,8 @@ def fit_camera(views: Sequence[Sighting]) -> CameraFit:
     return CameraFit(theta, poses, rms, scatter, max(scatter, LEAST_NOISE_PX * px_scale(size)))
 
 
-def _first_focal(views: Sequence[Sighting]) -> float:
-    """The median of those that single photographs tell; else the photograph's longer side."""
-    size = views[0].size
-    fits = [calibrated(view.points_m, view.points_px, size, ACCURACY_PX * px_scale(size)) for view in views]
-    told = [fit.focal for fit in fits if fit is not None and fit.focal_std < _TOLD * fit.focal]
-    return float(np.median(told)) if told else float(max(size))
-
-
 def _poses(views: Sequence[Sighting], theta: Theta) -> Float[np.ndarray, "V 6"]:
-    """The board's pose in each photograph, given the camera."""
+    """Find the board's pose in each photograph, given the camera."""
     K, poses = matrix(theta), []
     for view in views:
         straight = cv2.undistortPoints(view.points_px[:, None], K, np.array([theta[3], 0, 0, 0]), P=K)[:, 0]
@@ -201,16 +183,16 @@ def _split(x: Float[np.ndarray, "P"]) -> tuple[Theta, Float[np.ndarray, "V 6"]]:
 
 
 def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "V 6"]) -> OptimizeResult:
-    """Levenberg and Marquardt's method.
+    """Refine camera and poses by Levenberg and Marquardt's method.
 
-    What the corners do not tell stays near where it began: each parameter of the camera has a prior so loose that it
-    moves none that they do tell (by less than 1e-6 of its value), and is not counted as information.
+    What the corners do not determine stays near where it began: each parameter of the camera has a prior so loose that
+    it hardly moves one that they do determine (by less than 1e-6 of its value), and is not counted as information.
     """
-    points, centre, count = [on_board(view.points_m) for view in views], theta[0], len(poses) * POSE + INTRINSICS
+    points, centre, count = [on_plane(view.points_m) for view in views], theta[0], len(poses) * POSE + INTRINSICS
     side = max(views[0].size)
     pull = FINE_PX / np.multiply(_LOOSE, (1.0, side, side, 1.0))
 
-    def at(x: Float[np.ndarray, "P"]) -> list[tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2 10"]]]:
+    def at(x: Float[np.ndarray, "P"]) -> list[tuple[Points, Float[np.ndarray, "N 2 10"]]]:
         theta, poses = _split(x)
         bounded = np.append(np.clip(theta[0], centre - _FARTHEST, centre + _FARTHEST), theta[1:])
         return [seen(bounded, pose, its) for pose, its in zip(poses, points, strict=True)]
@@ -235,7 +217,7 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
     return least_squares(residuals, start, jacobian, **how)  # pyright: ignore[reportArgumentType]
 
 
-# How well photographs of the board tell a camera, and what that means in millimetres on the table.
+# How well photographs of the board determine a camera, and what that means in millimetres on the table.
 #
 # The normal matrix J^T J of a photograph is over (theta, pose); with corners that scatter by s, J^T J / s^2 is the
 # information that it brings. Poses of other photographs are eliminated (Schur complement), so that any number of
@@ -244,8 +226,6 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
 
 GRID_SIDE = 9  # points
 _SINGULAR = 1e-13  # of the normal matrix with a diagonal of 1: below, rounding decides
-
-Information = Float[np.ndarray, "P P"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,53 +243,47 @@ class TableError:
     seen_share: float
 
 
-def normal_matrix(theta: Theta, pose: PoseVector, points_m: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "10 10"]:
-    """J^T J of one photograph, over theta and the pose."""
-    rows = seen(theta, pose, on_board(points_m))[1].reshape(-1, INTRINSICS + POSE)
+def normal_matrix(theta: Theta, pose: PoseVector, points_m: Points) -> JointMatrix:
+    """Return J^T J of one photograph, over theta and the pose."""
+    rows = seen(theta, pose, on_plane(points_m))[1].reshape(-1, INTRINSICS + POSE)
     return rows.T @ rows
 
 
-def about_camera(normal: Float[np.ndarray, "10 10"]) -> Float[np.ndarray, "4 4"]:
-    """What a photograph tells of theta, whatever the board's pose: the Schur complement of the pose's block."""
+def about_camera(normal: JointMatrix) -> ThetaMatrix:
+    """Return a photograph's information on theta, whatever the board's pose: the Schur complement of its block."""
     across = normal[:INTRINSICS, INTRINSICS:]
     return normal[:INTRINSICS, :INTRINSICS] - across @ np.linalg.solve(normal[INTRINSICS:, INTRINSICS:], across.T)
 
 
-def total(parts: Iterable[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "4 4"]:
-    """What several photographs tell of theta; nothing if there are none."""
+def total(parts: Iterable[ThetaMatrix]) -> ThetaMatrix:
+    """Return the information on theta of several photographs; zeros for none."""
     return sum(parts, np.zeros((INTRINSICS, INTRINSICS)))
 
 
-def covariance(information: Information) -> Information:
-    """The inverse; very large, but finite, along what is not told."""
+def covariance(information: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P"]:
+    """Return the inverse; very large, but finite, along what is unknown."""
     scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     return (vectors / np.maximum(values, _SINGULAR)) @ vectors.T / np.outer(scale, scale)
 
 
-def workspace_grid() -> Float[np.ndarray, "G 3"]:
-    """Points of the table where objects lie [m]."""
+def workspace_grid() -> Points3:
+    """Return a grid of points over the workspace [m]."""
     line = np.linspace(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, GRID_SIDE)
     return np.stack(np.meshgrid(line, line, [0.0]), axis=-1).reshape(-1, 3)
 
 
-def in_picture(
-    theta: Theta, pose: PoseVector, points: Float[np.ndarray, "G 3"], size: tuple[int, int]
-) -> Bool[np.ndarray, "G"]:
-    """Which points of the board's frame a camera sees."""
+def in_picture(theta: Theta, pose: PoseVector, points: Points3, size: tuple[int, int]) -> Bool[np.ndarray, "G"]:
+    """Return which points of the board's frame a camera sees."""
     pixels = seen(theta, pose, points)[0]
     is_before = pose_of(pose).apply(points)[:, 2] > 0
     return is_before & np.all((pixels > 0) & (pixels < size), axis=1)
 
 
 def table_error(
-    theta: Theta,
-    pose: PoseVector,
-    spread: Float[np.ndarray, "10 10"],
-    points: Float[np.ndarray, "G 3"],
-    size: tuple[int, int],
+    theta: Theta, pose: PoseVector, spread: JointMatrix, points: Points3, size: tuple[int, int]
 ) -> TableError:
-    """Errors of table points that are located by their pixels u = pi(theta, pose, X), to first order.
+    """Predict the errors of table points that are located by their pixels u = pi(theta, pose, X), to first order.
 
         d X = -(d pi / d X)^-1 (d pi / d (theta, pose)) d (theta, pose),   X in the table's plane
 
@@ -333,10 +307,8 @@ def table_error(
     return TableError(float(errors.mean()), float(errors.max()), float(inside.mean()))
 
 
-def with_later_pose(
-    spread: Float[np.ndarray, "4 4"], normal: Float[np.ndarray, "10 10"], noise_px: float
-) -> Float[np.ndarray, "10 10"]:
-    """Covariance of theta and of a pose that is found with theta held fixed, in a photograph taken afterwards.
+def with_later_pose(spread: ThetaMatrix, normal: JointMatrix, noise_px: float) -> JointMatrix:
+    """Return the covariance of theta and of a pose that is found with theta fixed, in a photograph taken afterwards.
 
         d pose = -A_pp^-1 A_pt d theta + e,   Cov e = noise^2 A_pp^-1
 
@@ -352,12 +324,7 @@ def with_later_pose(
     return whole
 
 
-def padded(information: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "10 10"]:
-    """What is known of theta, over theta and a pose of which nothing is known."""
-    return np.pad(information, (0, POSE))
-
-
-# Which photograph would help a calibration most: hypothetical views of the board, each by what it would tell.
+# Which photograph would help a calibration most: hypothetical views of the board, compared by the error that is left.
 
 
 _TILT_RAD = np.deg2rad(40.0)
@@ -382,33 +349,14 @@ class Advice:
     mean_m: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Idea:
-    """A view of the board.
-
-    Attributes:
-        words: what to do.
-        tilt: of the board, a rotation vector in the camera's frame [rad].
-        place: of its middle in the picture, -1 to 1 along both axes.
-        nearness: factor on the usual distance.
-    """
-
-    words: str
-    tilt: tuple[float, float, float]
-    place: tuple[float, float] = (0.0, 0.0)
-    nearness: float = 1.0
-
-
 _TILT = "tilted by 30 to 45 degrees"
-_IDEAS = (
-    _Idea(f"show the board {_TILT} to the left or right", (0.0, _TILT_RAD, 0.0)),
-    _Idea(f"show the board {_TILT} towards you or away", (_TILT_RAD, 0.0, 0.0)),
-    _Idea(f"come nearer, with the board {_TILT}", (_TILT_RAD, 0.0, 0.0), (0.0, 0.0), _NEAR),
+_IDEAS = (  # words; the board's tilt [rad]; place of its middle in the picture, -1 to 1; factor on the usual distance
+    (f"show the board {_TILT} to the left or right", (0.0, _TILT_RAD, 0.0), (0.0, 0.0), 1.0),
+    (f"show the board {_TILT} towards you or away", (_TILT_RAD, 0.0, 0.0), (0.0, 0.0), 1.0),
+    (f"come nearer, with the board {_TILT}", (_TILT_RAD, 0.0, 0.0), (0.0, 0.0), _NEAR),
     *(
-        _Idea(
-            f"show the board, {_TILT}, in the {name} corner of the picture", (_TILT_RAD * x, _TILT_RAD * y, 0.0), place
-        )
-        for name, place, (x, y) in (
+        (f"show the board, {_TILT}, in the {name} corner of the picture", (_TILT_RAD * x, _TILT_RAD * y, 0.0), at, 1.0)
+        for name, at, (x, y) in (
             ("upper left", (-_CORNER, -_CORNER), (0.7, -0.7)),
             ("upper right", (_CORNER, -_CORNER), (0.7, 0.7)),
             ("lower left", (-_CORNER, _CORNER), (-0.7, -0.7)),
@@ -419,40 +367,29 @@ _IDEAS = (
 
 
 def best_next(
-    theta: Theta,
-    size: tuple[int, int],
-    distance_m: float,
-    board: Board,
-    expected_m: Callable[[Float[np.ndarray, "4 4"]], float],
+    theta: Theta, size: tuple[int, int], distance_m: float, expected_m: Callable[[ThetaMatrix], float]
 ) -> Advice | None:
-    """The idea after which the least error is to be expected; None if the board fits in the picture in none.
+    """Return the idea after which the least error is to be expected; None if the board fits in the picture in none.
 
     Args:
         theta: of the camera.
         size: width and height of the picture [px].
         distance_m: from which photographs have been taken [m].
-        board: that is photographed.
         expected_m: error on the table if the camera's normal matrix had this added [m].
     """
-    told = []
-    for idea in _IDEAS:
-        pose = _view(idea, theta, size, distance_m)
-        corners = board.corners_m()
-        shown = corners[in_picture(theta, pose, on_board(corners), size)]
-        if len(shown) >= _LEAST_CORNERS and (idea.nearness == 1 or len(shown) == len(corners)):
-            told.append(Advice(idea.words, expected_m(about_camera(normal_matrix(theta, pose, shown)))))
-    return min((each for each in told if np.isfinite(each.mean_m)), key=lambda each: each.mean_m, default=None)
-
-
-def _view(idea: _Idea, theta: Theta, size: tuple[int, int], distance_m: float) -> PoseVector:
-    """The board's pose in the camera's frame."""
-    pixel = np.array([*(np.array(size) / 2 * (1 + np.array(idea.place))), 1.0])
-    place = idea.nearness * distance_m * np.linalg.solve(matrix(theta), pixel)
-    return vector_of(Pose(place, quaternion_exp(np.array(idea.tilt))) @ _FACING)
+    found, corners = [], Board().corners_m()
+    for words, tilt, middle, nearness in _IDEAS:
+        pixel = np.array([*(np.array(size) / 2 * (1 + np.array(middle))), 1.0])
+        place = nearness * distance_m * np.linalg.solve(matrix(theta), pixel)
+        pose = vector_of(Pose(place, quaternion_exp(np.array(tilt))) @ _FACING)
+        shown = corners[in_picture(theta, pose, on_plane(corners), size)]
+        if len(shown) >= _LEAST_CORNERS and (nearness == 1 or len(shown) == len(corners)):
+            found.append(Advice(words, expected_m(about_camera(normal_matrix(theta, pose, shown)))))
+    return min((each for each in found if np.isfinite(each.mean_m)), key=lambda each: each.mean_m, default=None)
 
 
 def usual_table_view(theta: Theta, size: tuple[int, int]) -> PoseVector:
-    """The table 50 degrees below a camera, from where the workspace just fills the picture; in the camera's frame."""
+    """Return the table's pose 50 degrees below a camera, where the workspace just fills the picture."""
     direction, corners = np.array([0.0, -np.cos(_TABLE_ELEVATION_RAD), np.sin(_TABLE_ELEVATION_RAD)]), workspace_grid()
     pose, distance = np.zeros(6), _LEAST_TABLE_M
     while distance < _MOST_TABLE_M:
@@ -463,9 +400,9 @@ def usual_table_view(theta: Theta, size: tuple[int, int]) -> PoseVector:
     return pose
 
 
-# From sightings of the board to a camera, the error to expect on the table, and whether they tell enough.
+# From sightings of the board to a camera, the error to expect on the table, and whether they suffice.
 #
-# Whether photographs tell focal length from distance is decided by the standard deviation of the focal length,
+# Whether photographs separate focal length from distance is decided by the standard deviation of the focal length,
 # which J^T J and the residuals' variance give, not by the angles at which they were taken.
 
 
@@ -482,7 +419,7 @@ AT_ORIGIN = Pose.identity()
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Calibration:
-    """A camera as photographs of the board tell it.
+    """A camera that was calibrated from photographs of the board.
 
     Attributes:
         size: width and height of its photographs [px].
@@ -509,7 +446,7 @@ class Calibration:
 
 
 def board_place(x_m: float, y_m: float, turn_deg: float) -> Pose:
-    """`T_world_board` of a board that lies on the table.
+    """Return `T_world_board` of a board that lies on the table.
 
     Args:
         x_m: of its centre [m].
@@ -527,40 +464,27 @@ def board_place(x_m: float, y_m: float, turn_deg: float) -> Pose:
     return Pose(np.array([x_m, y_m, 0.0]), quaternion_exp(np.array([0.0, 0.0, np.deg2rad(turn_deg)])))
 
 
-class TooLittleSeen(OsfError):
-    """Photographs of the board that do not suffice to calibrate a camera."""
-
-
 def calibrated_camera(
-    views: Sequence[Sighting],
-    table: Sighting | None = None,
-    T_world_board: Pose = AT_ORIGIN,
-    board: Board | None = None,
+    views: Sequence[Sighting], table: Sighting | None = None, T_world_board: Pose = AT_ORIGIN
 ) -> Calibration:
-    """The camera; arguments and errors as of `assess`.
+    """Calibrate a camera; arguments and errors as of `assess`.
 
     Raises:
-        TooLittleSeen: also if the photographs do not suffice.
+        OsfError: also if the photographs do not suffice.
     """
-    found = assess(views, table, T_world_board, board)
+    found = assess(views, table, T_world_board)
     if found.missing:
-        raise TooLittleSeen(found.missing)
+        raise OsfError(found.missing)
     return found
 
 
-def assess(
-    views: Sequence[Sighting],
-    table: Sighting | None = None,
-    T_world_board: Pose = AT_ORIGIN,
-    board: Board | None = None,
-) -> Calibration:
-    """What photographs tell so far, whether or not they suffice.
+def assess(views: Sequence[Sighting], table: Sighting | None = None, T_world_board: Pose = AT_ORIGIN) -> Calibration:
+    """Calibrate a camera as far as photographs determine it, whether or not they suffice.
 
     Args:
         views: of the board by one camera, from various sides.
         table: the board lying on the table, by that camera in the place where it stays.
         T_world_board: where the board lies then.
-        board: that was printed; the default one if not given.
 
     Raises:
         InvalidInput: if there are no photographs or too many, or they contradict each other altogether.
@@ -568,86 +492,62 @@ def assess(
     """
     every = [*views, *([] if table is None else [table])]
     _check_photos(every)
-    fit = fit_camera(every)
+    fit, size = fit_camera(every), every[0].size
     _check_agreement(every, fit)
-    known = [normal_matrix(fit.theta, pose, v.points_m) for v, pose in zip(every, fit.poses, strict=True)]
-    board, place = board or Board(), None if table is None else T_world_board
-    on_table = _OnTable.of(fit, every[0].size, known, place, board)
-    told = on_table.error()
+    normals = [normal_matrix(fit.theta, pose, v.points_m) for v, pose in zip(every, fit.poses, strict=True)]
+    error_with = _error_on_table(fit, size, normals, None if table is None else T_world_board)
+    error = error_with(np.zeros((INTRINSICS, INTRINSICS)))
     distance = float(np.median(np.linalg.norm(fit.poses[:, 3:], axis=1)))
-    advice = best_next(fit.theta, every[0].size, distance, board, lambda more: on_table.error(more).mean_m)
-    spread = fit.noise_px**2 * covariance(total(about_camera(normal) for normal in known))
+    advice = best_next(fit.theta, size, distance, lambda more: error_with(more).mean_m)
+    spread = fit.noise_px**2 * covariance(total(map(about_camera, normals)))
     focal_std = float(np.sqrt(spread[0, 0]))
+    names = [view.name for view in every]  # many phones call each photograph image.jpg
+    names = [f"{name} ({names[:k].count(name) + 1})" if name in names[:k] else name for k, name in enumerate(names)]
     return Calibration(
-        every[0].size,
+        size,
         fit.lens,
         focal_std * float(np.exp(fit.theta[0])),
         fit.noise_px,
-        dict(zip(_different([view.name for view in every]), fit.rms_px.tolist(), strict=True)),
+        dict(zip(names, fit.rms_px.tolist(), strict=True)),
         None if table is None else T_world_board @ pose_of(fit.poses[-1]).inverse(),
-        told,
+        error,
         advice,
-        _missing(len(every), focal_std, told, advice),
+        _missing(len(every), focal_std, error, advice),
     )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _OnTable:
-    """What is known of a camera over the table.
+def _error_on_table(
+    fit: CameraFit, size: tuple[int, int], normals: Sequence[JointMatrix], place: Pose | None
+) -> Callable[[ThetaMatrix], TableError]:
+    """Return a function from further information on theta to the error to be expected on the table.
 
-    Attributes:
+    Args:
         fit: the camera.
         size: of its picture [px].
-        about_camera: normal matrix over theta, of all photographs but that of the table.
-        about_table: of the photograph of the table, over theta and pose.
-        pose: of the board in that photograph.
-        grid: the workspace in the board's frame [m].
-        is_later: whether that photograph is not one of the calibration's, so that its pose alone follows from it.
+        normals: matrices of its photographs.
+        place: of the board on the table in the last of them; without, the error is that of a later photograph from a
+            usual place, whose pose alone follows from it.
     """
+    parts = [about_camera(normal) for normal in normals]
+    if place is None:
+        known, grid, pose = total(parts), workspace_grid(), usual_table_view(fit.theta, size)
+        last = normal_matrix(fit.theta, pose, Board().corners_m())
+    else:
+        known, grid, pose = total(parts[:-1]), place.inverse().apply(workspace_grid()), fit.poses[-1]
+        last = normals[-1]
 
-    fit: CameraFit
-    size: tuple[int, int]
-    about_camera: Float[np.ndarray, "4 4"]
-    about_table: Float[np.ndarray, "10 10"]
-    pose: PoseVector
-    grid: Float[np.ndarray, "G 3"]
-    is_later: bool
-
-    @staticmethod
-    def of(
-        fit: CameraFit,
-        size: tuple[int, int],
-        normals: Sequence[Float[np.ndarray, "10 10"]],
-        place: Pose | None,
-        board: Board,
-    ) -> _OnTable:
-        """The last photograph shows the board on the table in its place; a usual one will if there is no place."""
-        if place is not None:
-            known, there = total(map(about_camera, normals[:-1])), place.inverse().apply(workspace_grid())
-            return _OnTable(fit, size, known, normals[-1], fit.poses[-1], there, False)
-        pose = usual_table_view(fit.theta, size)
-        seen = normal_matrix(fit.theta, pose, board.corners_m())
-        return _OnTable(fit, size, total(map(about_camera, normals)), seen, pose, workspace_grid(), True)
-
-    def error(self, more: Float[np.ndarray, "4 4"] | float = 0.0) -> TableError:
-        """To expect if `more` is known of the camera."""
-        noise, known = self.fit.noise_px, self.about_camera + more
-        if self.is_later:
-            spread = with_later_pose(noise**2 * covariance(known), self.about_table, noise)
+    def error_with(more: ThetaMatrix) -> TableError:
+        if place is None:
+            spread = with_later_pose(fit.noise_px**2 * covariance(known + more), last, fit.noise_px)
         else:
-            spread = noise**2 * covariance(self.about_table + padded(known))
-        return table_error(self.fit.theta, self.pose, spread, self.grid, self.size)
+            spread = fit.noise_px**2 * covariance(last + np.pad(known + more, (0, POSE)))
+        return table_error(fit.theta, pose, spread, grid, size)
+
+    return error_with
 
 
 def _missing(count: int, focal_share: float, table: TableError, advice: Advice | None) -> str:
-    """Why photographs do not suffice, a sentence; empty where they do.
-
-    Args:
-        count: of photographs.
-        focal_share: standard deviation of the focal length, as a share of it.
-        table: error to expect.
-        advice: what to photograph next.
-    """
+    """Return why photographs do not suffice, a sentence; empty where they do."""
     following = "" if advice is None else f"; in the next, {advice.words}"
     if count < LEAST_PHOTOS:
         what, allowed = "number of photos of the board", f"{LEAST_PHOTOS} or more, from different sides{following}"
@@ -660,11 +560,6 @@ def _missing(count: int, focal_share: float, table: TableError, advice: Advice |
         what, allowed = "part of the workspace in the photo of the table", "larger: check the place of the board"
         return str(InvalidInput(what, "none", allowed))
     return ""
-
-
-def _different(names: Sequence[str]) -> list[str]:
-    """Names with a number behind those that were there before: many phones call each photograph image.jpg."""
-    return [f"{name} ({names[:k].count(name) + 1})" if name in names[:k] else name for k, name in enumerate(names)]
 
 
 def _check_photos(every: Sequence[Sighting]) -> None:
@@ -748,7 +643,7 @@ class KnownCamera:
     Attributes:
         size: width and height of its photographs [px].
         lens: in these pixels.
-        T_world_camera: where it stands; None if it was not told.
+        T_world_camera: where it stands; None if unknown.
     """
 
     size: tuple[int, int]
@@ -756,7 +651,7 @@ class KnownCamera:
     T_world_camera: Pose | None
 
     def lens_at(self, size: tuple[int, int]) -> Lens:
-        """The lens for photographs of this width and height [px].
+        """Return the lens for photographs of this width and height [px].
 
         Raises:
             InvalidInput: if they have another shape, so that another camera took them, or they were cropped.
@@ -770,7 +665,7 @@ class KnownCamera:
 
 
 def calibration_to_json(found: Calibration, name: str) -> dict[str, Any]:
-    """A calibration as plain lists and numbers."""
+    """Return a calibration as plain lists and numbers."""
     pose = None if found.T_world_camera is None else found.T_world_camera.matrix().tolist()
     is_seen = found.table.seen_share > 0
     error = ExpectedError(mean=1e3 * found.table.mean_m, worst=1e3 * found.table.worst_m) if is_seen else None
@@ -791,43 +686,34 @@ def calibration_to_json(found: Calibration, name: str) -> dict[str, Any]:
 
 
 def known_camera(data: object) -> KnownCamera:
-    """The camera of parsed JSON; cameras of scene.json are taken, too.
+    """Return the camera of parsed JSON; cameras of scene.json are taken, too.
 
     Raises:
         InvalidInput: if something is missing or out of range.
     """
     entry = decode(CalibrationJson, data, "camera")
     check_ranges(("radial of the camera", entry.radial, -_MOST_RADIAL, _MOST_RADIAL))
-    K = _checked(np.array(entry.K), max(entry.width, entry.height))
-    pose = None if entry.T_world_camera is None else _rigid(np.array(entry.T_world_camera))
-    return KnownCamera((entry.width, entry.height), Lens(K, entry.radial), pose)
-
-
-def read_camera(path: Path) -> KnownCamera:
-    """The camera in a file.
-
-    Raises:
-        CorruptFile: if it cannot be read or is no camera; the message says why.
-    """
-    return read_json(path, known_camera)
-
-
-def _checked(K: Float[np.ndarray, "3 3"], side: int) -> Float[np.ndarray, "3 3"]:
+    K, side, pose = np.array(entry.K), max(entry.width, entry.height), None
     if not np.array_equal(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], (0, 0, 0, 0, 1)):
         raise InvalidInput("K of the camera", K.tolist(), "[[f, 0, x], [0, f, y], [0, 0, 1]]")
     low, high = np.multiply(_FOCAL_RANGE, side).tolist()
     for number in (0, 1):
         check_ranges(("focal length of the camera [px]", K[number, number], low, high))
         check_ranges(("principal point of the camera [px]", K[number, 2], -side, 2 * side))
-    return K
+    if entry.T_world_camera is not None:
+        matrix = np.array(entry.T_world_camera)
+        R = matrix[:3, :3]
+        is_rotation = np.allclose(R @ R.T, np.eye(3), atol=1e-4) and np.linalg.det(R) >= 0
+        if not is_rotation or not np.allclose(matrix[3], (0, 0, 0, 1)):
+            raise InvalidInput("T_world_camera of the camera", matrix.tolist(), "a rotation and a translation, 4 x 4")
+        pose = Pose.from_matrix(matrix)
+    return KnownCamera((entry.width, entry.height), Lens(K, entry.radial), pose)
 
 
-def _rigid(matrix: Float[np.ndarray, "4 4"]) -> Pose:
-    R = matrix[:3, :3]
-    if (
-        not np.allclose(R @ R.T, np.eye(3), atol=1e-4)
-        or np.linalg.det(R) < 0
-        or not np.allclose(matrix[3], (0, 0, 0, 1))
-    ):
-        raise InvalidInput("T_world_camera of the camera", matrix.tolist(), "a rotation and a translation, 4 x 4")
-    return Pose.from_matrix(matrix)
+def read_camera(path: Path) -> KnownCamera:
+    """Read a calibrated camera from a file.
+
+    Raises:
+        CorruptFile: if it cannot be read or is no camera; the message says why.
+    """
+    return read_json(path, known_camera)

@@ -6,7 +6,7 @@
      "light": {"direction": [3], "std_deg", "diffuse", "distance_m", "distance_std_m"},
      "camera": {"name", "T_world_camera": 4x4, "K": 3x3, "width", "height"}, "other_cameras": [...], "notes": [...]}
 
-"board" and "objects" say what tells where the table is. "light" is null where too few pixels show objects.
+"board" and "objects" say how the table was found. "light" is null where too few pixels show objects.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class FoundPose(Entry):
     iou: float = Field(description="Of the outline and the mask, 1 where they agree.")
 
     def pose(self) -> Pose:
-        """As the rest of the program has it."""
+        """Return the pose."""
         return Pose(np.array(self.position), np.array(self.quaternion))
 
 
@@ -44,7 +44,7 @@ class FoundObject(FoundPose):
     rivals: list[FoundPose] = Field(description="Other orientations that explain the picture, the best first.")
 
     def poses(self) -> tuple[FoundPose, ...]:
-        """The best, then its rivals."""
+        """Return the best pose, then its rivals."""
         return self, *self.rivals
 
 

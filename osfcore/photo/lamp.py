@@ -1,9 +1,10 @@
-"""The lamp of photographs: its direction, its distance where the pictures tell it, and what its shadows exclude."""
+"""The lamp of photographs: its direction from shading and shadows, and its distance where the pictures show it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,13 +12,17 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.optimize import least_squares
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.objective import fibonacci_sphere
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import MIN_LAMP_DISTANCE_M, MIN_LIGHT_ELEVATION_DEG, SpotLamp
-from osfcore.geometry.poses import Pose, orthogonal_basis, quaternion_to_matrix, rotate
+from osfcore.geometry.poses import Pose, fibonacci_sphere, orthogonal_basis, quaternion_to_matrix, rotate
 from osfcore.photo.photograph import Photograph
-from osfcore.photo.pose_loss import Surfels, draw, draw_surfels, object_windows
+from osfcore.photo.pose_loss import Surfels, draw, draw_surfels, lens, object_windows, rotation_and_position
 from osfcore.photo.poses import PhotoObject
+
+Vector = Float[np.ndarray, "3"]
+Vectors = Float[np.ndarray, "P 3"]
+Colours = Float[np.ndarray, "P C"]
+PerPixel = Float[np.ndarray, "P"]
 
 # The direction toward a lamp, from the shading of surfaces whose normals and albedo are known.
 #
@@ -32,17 +37,22 @@ from osfcore.photo.poses import PhotoObject
 # n . l / 2 + ...), 0 for a sky.
 
 
-Visibility = Callable[[Float[np.ndarray, "3"]], Float[np.ndarray, "P"]]
+Visibility = Callable[[Vector], PerPixel]
 
 _DIRECTIONS = 600
 _SHADED = 60  # of them, the best without shadows, that are compared with them
-_RIDGE = 0.05  # of the harmonics: a lamp explains a gradient rather than they
+_RIDGE = 0.05  # of the harmonics, which explain less of a gradient than a lamp
 _ROUNDS = 3  # of reweighting
 _TUKEY = 4.685  # deviations; 95 % efficient for normal errors
 _LEAST_STD = 2e-3  # [radiance]
 _LEAST_GAIN = 0.05  # share of the harmonics' squared residual that a lamp must explain
 _MOST_DIRECTED = 1.0  # |b| / a of what is called diffuse
-_FEWEST = 50
+_FEWEST = 50  # pixels
+
+
+def _check_count(pixels: np.ndarray) -> None:
+    if len(pixels) < _FEWEST:
+        raise InvalidInput("number of shaded pixels", len(pixels), f"{_FEWEST} or more")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -55,9 +65,9 @@ class ShadedPixels:
         normals: unit, outward.
     """
 
-    radiance: Float[np.ndarray, "P 3"]
-    albedo: Float[np.ndarray, "P 3"]
-    normals: Float[np.ndarray, "P 3"]
+    radiance: Vectors
+    albedo: Vectors
+    normals: Vectors
 
     def __post_init__(self) -> None:
         """Check the number of pixels.
@@ -65,8 +75,7 @@ class ShadedPixels:
         Raises:
             InvalidInput: if there are fewer than 50.
         """
-        if len(self.radiance) < _FEWEST:
-            raise InvalidInput("number of shaded pixels", len(self.radiance), f"{_FEWEST} or more")
+        _check_count(self.radiance)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -82,10 +91,10 @@ class LampFit:
         is_diffuse: nothing speaks for a lamp; the direction then means little.
     """
 
-    direction: Float[np.ndarray, "3"]
+    direction: Vector
     std: float
-    strength: Float[np.ndarray, "3"]
-    ambient: Float[np.ndarray, "3"]
+    strength: Vector
+    ambient: Vector
     gain: float
     is_diffuse: bool
 
@@ -109,17 +118,16 @@ def fit_lamp(pixels: ShadedPixels, visible: Visibility | None = None) -> LampFit
     direction, std = _refine(pixels, direction, visible, weights)
     residual, light = _solve(pixels, direction, visible, weights)
     without, harmonics = _solve(pixels, None, visible, weights)
-    gain = 1 - _squared(residual, weights) / max(_squared(without, weights), 1e-12)
-    ambient, gradient = harmonics.mean(axis=0)[0], harmonics.mean(axis=0)[1:]
-    is_directed = np.linalg.norm(gradient) > _MOST_DIRECTED * max(float(ambient), 0.0)
-    is_diffuse = light[:, -1].mean() <= 0 or not (is_directed or gain > _LEAST_GAIN)
-    return LampFit(direction, std, light[:, -1], light[:, 0], float(gain), bool(is_diffuse))
+    gain = _gain(residual, without, weights)
+    ambient, *gradient = harmonics.mean(axis=0)
+    is_diffuse = light[:, -1].mean() <= 0 or not _speaks_for_lamp(gain, np.array(gradient), float(ambient))
+    return LampFit(direction, std, light[:, -1], light[:, 0], gain, bool(is_diffuse))
 
 
 def _solve(
     pixels: ShadedPixels, direction: np.ndarray | None, visible: Visibility | None, weights: np.ndarray
-) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "3 K"]]:
-    """Residuals of the least-squares light under a lamp from a direction, or without a lamp; and that light."""
+) -> tuple[Vectors, Float[np.ndarray, "3 K"]]:
+    """Fit the light under a lamp from a direction, or without a lamp, and return the residuals and that light."""
     basis = [np.ones(len(weights)), *pixels.normals.T]
     if direction is not None:
         lit = np.maximum(pixels.normals @ direction, 0)
@@ -140,7 +148,7 @@ def _solve(
 def _refine(
     pixels: ShadedPixels, start: np.ndarray, visible: Visibility | None, weights: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """The direction nearby with the least weighted residual, and its standard deviation [rad]."""
+    """Return the direction nearby with the least weighted residual, and its standard deviation [rad]."""
     right, up = orthogonal_basis(start)
     root = np.sqrt(weights)[:, None]
 
@@ -167,29 +175,30 @@ def _squared(residual: np.ndarray, weights: np.ndarray) -> float:
     return float((weights[:, None] * residual**2).sum())
 
 
-# Cast shadows of known objects: their surfels, drawn from the lamp, tell what it sees (Williams 1978).
+def _gain(residual: np.ndarray, without: np.ndarray, weights: np.ndarray) -> float:
+    """Return the share of the squared residual without a lamp that the lamp explains."""
+    return 1 - _squared(residual, weights) / max(_squared(without, weights), 1e-12)
+
+
+def _speaks_for_lamp(gain: float, gradient: Vector, ambient: float) -> bool:
+    """Return whether objects show a lamp: it explains more than harmonics, or these are more directed than a room's."""
+    return bool(np.linalg.norm(gradient) > _MOST_DIRECTED * max(ambient, 0.0)) or gain > _LEAST_GAIN
+
+
+# Cast shadows of known objects: their surfels, drawn from the lamp, show what it lights (Williams 1978).
 #
 # A point is lit as far as nothing nearer to the lamp was drawn where it would be seen; between the four pixels
 # around it the answer is interpolated, so that it changes gradually as the lamp moves. Distant lamps stand a
 # hundred times the objects' extent away.
 
 
-SIDE = 224  # of the picture that the lamp sees [px]
+_SIDE = 224  # of the picture that the lamp sees [px]
 _FAR = 100.0  # radii of all objects together, at which a distant lamp stands
 _SURFELS = 6000  # of an object, about
 _HALF_SIDE = 0.75  # of a surfel, in spacings
 _LIFT = 1.5  # spacings
 _TOLERANCE_M = 1e-3  # by which what hides a point must be nearer
 _WIDEST_RAD = 1.2  # half the lamp's field of view
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Caster:
-    """Surfels in the world, and the distance between neighbours [m]."""
-
-    points: Float32[np.ndarray, "S 3"]
-    normals: Float32[np.ndarray, "S 3"]
-    spacing: float
 
 
 class Shadows:
@@ -201,93 +210,74 @@ class Shadows:
     """
 
     def __init__(self, surfels: Sequence[Surfels], poses: Sequence[Pose]) -> None:
-        thinned = [_thinned(s) for s in surfels]
-        self._casters = [
-            _Caster(*_placed(points, normals, pose), spacing)
-            for (points, normals, spacing), pose in zip(thinned, poses, strict=True)
-        ]
-        everything = np.concatenate([np.zeros((0, 3), np.float32), *(c.points for c in self._casters)])
+        self._casters = [_caster(its, pose) for its, pose in zip(surfels, poses, strict=True)]
+        everything = np.concatenate([np.zeros((0, 3), np.float32), *(points for points, _, _ in self._casters)])
         low, high = (everything.min(axis=0), everything.max(axis=0)) if len(everything) else np.zeros((2, 3))
-        self.centre: Float[np.ndarray, "3"] = ((low + high) / 2).astype(float)
-        """Of all objects [m]."""
+        self.centre: Vector = ((low + high) / 2).astype(float)
+        """Centre of all objects [m]."""
         self.radius = float(np.linalg.norm(everything - self.centre, axis=1).max(initial=0.0))
-        """Of the sphere around it that holds them [m]."""
-        self._lift_m = _LIFT * max((c.spacing for c in self._casters), default=0.0)
+        """Radius of the sphere around it that holds them [m]."""
+        self._lift_m = _LIFT * max((spacing for _, _, spacing in self._casters), default=0.0)
 
-    def lifted(self, points: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-        """Points of the objects' own surfaces, lifted so that these do not shade themselves [m]."""
+    def lifted(self, points: Vectors, normals: Vectors) -> Vectors:
+        """Lift points of the objects' own surfaces so that these do not shade themselves [m]."""
         return points + self._lift_m * normals
 
-    def from_direction(
-        self, direction: Float[np.ndarray, "3"], points: Float[np.ndarray, "P 3"]
-    ) -> Float[np.ndarray, "P"]:
-        """Shares of a distant lamp's light from a unit direction that reach points [m]."""
+    def from_direction(self, direction: Vector, points: Vectors) -> PerPixel:
+        """Return the shares of a distant lamp's light from a unit direction that reach points [m]."""
         return self.from_place(self.centre + _FAR * max(self.radius, 1e-3) * direction, points)
 
-    def from_place(self, place: Float[np.ndarray, "3"], points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-        """Shares of the light of a lamp at a place [m] that reach points [m]."""
+    def from_place(self, place: Vector, points: Vectors) -> PerPixel:
+        """Return the shares of the light of a lamp at a place [m] that reach points [m]."""
         distance = float(np.linalg.norm(self.centre - place))
         if not self._casters or distance < 1e-6:
             return np.ones(len(points))
         half = min(float(np.arcsin(min(1.05 * self.radius / distance, 1.0))), _WIDEST_RAD)
-        camera = Camera.look_at("lamp", place, self.centre, size=SIDE, fov_y_deg=float(np.rad2deg(2 * half)))
+        camera = Camera.look_at("lamp", place, self.centre, size=_SIDE, fov_y_deg=float(np.rad2deg(2 * half)))
         to_lamp = camera.T_world_camera.inverse()
-        return _lit(self._drawn(to_lamp, camera.intrinsics), to_lamp.apply(points), camera.intrinsics)
-
-    def _drawn(self, to_lamp: Pose, intrinsics: np.ndarray) -> Float32[np.ndarray, "side side"]:
-        """Depth of what the lamp sees first, along its axis [m]; huge where it sees nothing."""
-        rotation = np.ascontiguousarray(quaternion_to_matrix(to_lamp.quaternion), np.float32)
-        position = np.ascontiguousarray(to_lamp.position, np.float32)
-        lens = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
-        nearest = np.full((SIDE, SIDE), 1e9, np.float32)
-        depth, index = np.empty((SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.int32)
-        for caster in self._casters:
-            half = np.float32(_HALF_SIDE * caster.spacing)
-            draw_surfels(caster.points, caster.normals, half, rotation, position, lens, depth, index)
+        numbers = *rotation_and_position(to_lamp), lens(camera.intrinsics)
+        nearest = np.full((_SIDE, _SIDE), 1e9, np.float32)  # depth of what the lamp sees first [m]
+        depth, index = np.empty((_SIDE, _SIDE), np.float32), np.empty((_SIDE, _SIDE), np.int32)
+        for surfels, normals, spacing in self._casters:
+            draw_surfels(surfels, normals, np.float32(_HALF_SIDE * spacing), *numbers, depth, index)
             np.minimum(nearest, depth, out=nearest)
-        return nearest
+        return _lit(nearest, to_lamp.apply(points), camera.intrinsics)
 
 
-def _lit(
-    nearest: Float32[np.ndarray, "side side"], local: Float[np.ndarray, "P 3"], K: np.ndarray
-) -> Float[np.ndarray, "P"]:
-    """Shares of the four pixels around each point, in the lamp's frame, that show nothing nearer than it."""
+def _lit(nearest: Float32[np.ndarray, "side side"], local: Vectors, K: np.ndarray) -> PerPixel:
+    """Return the share of the four pixels around each point, in the lamp's frame, that show nothing nearer than it."""
     depth = np.maximum(local[:, 2], 1e-6)
     x, y = (K[axis, axis] * local[:, axis] / depth + K[axis, 2] - 0.5 for axis in range(2))
-    seen = (local[:, 2] > 1e-6) & (x > 0) & (y > 0) & (x < SIDE - 1) & (y < SIDE - 1)
+    seen = (local[:, 2] > 1e-6) & (x > 0) & (y > 0) & (x < _SIDE - 1) & (y < _SIDE - 1)
     x, y = np.where(seen, x, 0), np.where(seen, y, 0)
-    column, row = np.minimum(x.astype(np.int64), SIDE - 2), np.minimum(y.astype(np.int64), SIDE - 2)
+    column, row = np.minimum(x.astype(np.int64), _SIDE - 2), np.minimum(y.astype(np.int64), _SIDE - 2)
     right, below = x - column, y - row
     lit = np.zeros(len(local))
-    flat, first, level = nearest.ravel(), row * SIDE + column, (depth - _TOLERANCE_M).astype(np.float32)
+    flat, first, level = nearest.ravel(), row * _SIDE + column, (depth - _TOLERANCE_M).astype(np.float32)
     shares = (1 - right) * (1 - below), right * (1 - below), (1 - right) * below, right * below
-    for step, share in zip((0, 1, SIDE, SIDE + 1), shares, strict=True):
+    for step, share in zip((0, 1, _SIDE, _SIDE + 1), shares, strict=True):
         lit += share * (flat[first + step] >= level)
     return np.where(seen, lit, 1.0)
 
 
-def _thinned(surfels: Surfels) -> tuple[np.ndarray, np.ndarray, float]:
-    """Points, normals and spacing of about 6000 of an object's surfels: shadows need no more."""
-    coarser = max(np.sqrt(len(surfels.points) / _SURFELS), 1.0)
+def _caster(surfels: Surfels, pose: Pose) -> tuple[Float32[np.ndarray, "S 3"], Float32[np.ndarray, "S 3"], float]:
+    """Return points and normals in the world of about 6000 surfels, all that shadows need, and their spacing [m]."""
+    points, normals = surfels.points, surfels.normals
+    coarser = max(np.sqrt(len(points) / _SURFELS), 1.0)
     spacing = float(coarser * surfels.spacing)
-    if coarser == 1:
-        return surfels.points, surfels.normals, spacing
-    cells = np.floor(surfels.points / spacing).astype(np.int64)
-    _, kept = np.unique(cells, axis=0, return_index=True)
-    return surfels.points[kept], surfels.normals[kept], spacing
-
-
-def _placed(points: np.ndarray, normals: np.ndarray, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+    if coarser > 1:
+        _, kept = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)
+        points, normals = points[kept], normals[kept]
     rotation = quaternion_to_matrix(pose.quaternion)
     moved, turned = points @ rotation.T + pose.position, normals @ rotation.T
-    return np.ascontiguousarray(moved, np.float32), np.ascontiguousarray(turned, np.float32)
+    return np.ascontiguousarray(moved, np.float32), np.ascontiguousarray(turned, np.float32), spacing
 
 
 # Pixels of photographs of which the place and the normal are known: of objects, and of the table around them.
 
 
-FEWEST = 50
 TABLE = -1
+PixelColumns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # radiance, albedo, points and normals
 _MASK_SIDE, _TABLE_SIDE = 60, 320  # of masks and photographs, as they are looked at [px]
 _OBJECT_PIXELS, _TABLE_PIXELS = 600, 1800  # of one object, and of the table, in one photograph
 _AROUND_M = 0.4  # of the table, around the objects
@@ -309,10 +299,10 @@ class LitPixels:
         shadows: what objects hide from lamps.
     """
 
-    radiance: Float[np.ndarray, "P 3"]
-    albedo: Float[np.ndarray, "P 3"]
-    points: Float[np.ndarray, "P 3"]
-    normals: Float[np.ndarray, "P 3"]
+    radiance: Vectors
+    albedo: Vectors
+    points: Vectors
+    normals: Vectors
     owner: Int[np.ndarray, "P"]
     view: Int[np.ndarray, "P"]
     shadows: Shadows
@@ -323,21 +313,20 @@ class LitPixels:
         Raises:
             InvalidInput: if there are fewer than 50.
         """
-        if len(self.radiance) < FEWEST:
-            raise InvalidInput("number of shaded pixels", len(self.radiance), f"{FEWEST} or more")
+        _check_count(self.radiance)
 
     @property
     def on_table(self) -> Bool[np.ndarray, "P"]:
-        """Which show the table."""
+        """Mark the pixels that show the table."""
         return self.owner == TABLE
 
-    def lifted(self) -> Float[np.ndarray, "P 3"]:
-        """Points from which a lamp may be seen: off the surface where it could shade itself [m]."""
+    def lifted(self) -> Vectors:
+        """Return points from which a lamp may be seen: off the surface where it could shade itself [m]."""
         return np.where(self.on_table[:, None], self.points, self.shadows.lifted(self.points, self.normals))
 
-    def every(self, step: int) -> LitPixels:
-        """Every so many of them."""
-        some = slice(None, None, step)
+    def about(self, count: int) -> LitPixels:
+        """Return about so many of the pixels, evenly chosen."""
+        some = slice(None, None, max(len(self.radiance) // count, 1))
         return LitPixels(self.radiance[some], self.albedo[some], self.points[some], self.normals[some],
                          self.owner[some], self.view[some], self.shadows)  # fmt: skip
 
@@ -349,7 +338,7 @@ def lit_pixels(
     *,
     covered_m: tuple[float, float] | None = None,
 ) -> LitPixels:
-    """Pixels that show objects, and where the table's plane is known, the table.
+    """Collect the pixels that show objects, and where the table's plane is known, the table.
 
     Args:
         photos: of one scene, with masks.
@@ -368,15 +357,17 @@ def lit_pixels(
                 parts.append((*_object_pixels(photo, name, pose, surfels[name]), owner, view))
         if photo.on_table:
             parts.append((*_table_pixels(photo, shadows.centre, covered_m), TABLE, view))
-    columns = [np.concatenate([np.zeros((0, 3)), *(part[k] for part in parts)]) for k in range(4)]
     owner, view = (np.repeat([p[k] for p in parts], [len(p[0]) for p in parts]).astype(int) for k in (4, 5))
-    return LitPixels(columns[0], columns[1], columns[2], columns[3], owner, view, shadows)
+    return LitPixels(*_joined(parts), owner, view, shadows)
 
 
-def object_pixels(
-    photo: Photograph, name: str, pose: Pose, surfels: Surfels
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Radiance, albedo, points in the world [m] and normals of well exposed pixels that show an object.
+def _joined(parts: Sequence[tuple[Any, ...]]) -> list[Vectors]:
+    """Concatenate the first four columns of parts: radiance, albedo, points and normals."""
+    return [np.concatenate([np.zeros((0, 3)), *(part[k] for part in parts)]) for k in range(4)]
+
+
+def object_pixels(photo: Photograph, name: str, pose: Pose, surfels: Surfels) -> PixelColumns:
+    """Return radiance, albedo, points in the world [m] and normals of well exposed pixels that show an object.
 
     Args:
         photo: with a mask of the object.
@@ -385,17 +376,15 @@ def object_pixels(
         surfels: of the object.
     """
     window = object_windows([photo], name, _MASK_SIDE)[0]
-    index, _ = draw(surfels, window, Pose(pose.position[None], pose.quaternion[None]))
+    index, _ = draw(surfels, window, pose[None])
     shown = (index[0] >= 0) & window.plain
     seen = index[0][shown]
     normals, points = rotate(pose.quaternion, surfels.normals[seen]), pose.apply(surfels.points[seen])
     return window.image[shown], surfels.albedo[seen], points, normals
 
 
-def _object_pixels(
-    photo: Photograph, name: str, pose: Pose, surfels: Surfels
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Some of `object_pixels`, none of which is seen at a grazing angle."""
+def _object_pixels(photo: Photograph, name: str, pose: Pose, surfels: Surfels) -> PixelColumns:
+    """Return some of `object_pixels`, none of which is seen at a grazing angle."""
     try:
         radiance, albedo, points, normals = object_pixels(photo, name, pose, surfels)
     except InvalidInput:  # a tiny mask in one of several views
@@ -408,10 +397,8 @@ def _object_pixels(
     return radiance[kept], albedo[kept], points[kept], normals[kept]
 
 
-def _table_pixels(
-    photo: Photograph, centre: np.ndarray, covered_m: tuple[float, float] | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Radiance, ones, points in the world [m] and normals of well exposed pixels of the table near the objects."""
+def _table_pixels(photo: Photograph, centre: np.ndarray, covered_m: tuple[float, float] | None) -> PixelColumns:
+    """Return radiance, ones, points [m] and normals of well exposed pixels of the table near the objects."""
     full, photo = photo, photo.with_masks({}).resized(_TABLE_SIDE)
     objects = np.zeros((full.height, full.width), np.uint8)
     for mask in full.masks.values():
@@ -436,7 +423,7 @@ def _table_pixels(
     return photo.image[rows[kept], columns[kept]], np.ones((len(kept), 3)), flat, normals
 
 
-# What share of a lamp's light falls on each pixel: n . l, visibility, falloff and cone, by few numbers.
+# A lamp by few numbers, and the share of its light that falls on each pixel: n . l, visibility, falloff and cone.
 #
 # The lamp stands at centre + direction / q: q = 1 / distance is searched rather than the distance, since it is
 # bounded, and small for a distant lamp. The direction is a step in the tangent plane of a base direction. The cone
@@ -445,7 +432,7 @@ def _table_pixels(
 
 
 STEPS = np.array([0.012, 0.012, 0.05, 0.01, 0.01, 0.03, 0.03])
-"""Of the numbers x of `LampShape.moved`, at which the light changes noticeably, but still linearly."""
+"""Steps of the numbers x of `LampShape.moved`, at which the light changes noticeably, but still linearly."""
 PLACE_NUMBERS = 3  # of those, that say where the lamp is
 NEAREST_M, FARTHEST_M = 0.2, 25.0
 _SHARES = 0.2, 0.98  # inner over outer half-angle
@@ -458,7 +445,7 @@ class LampShape:
     """A lamp.
 
     Attributes:
-        centre: what its direction and distance are told from [m].
+        centre: from which its direction and distance are counted [m].
         direction: unit vector from there toward the lamp.
         inverse: of the distance [1/m].
         aim: x and y of the point that it looks at, from the centre [m].
@@ -466,21 +453,21 @@ class LampShape:
         inner_share: the inner half-angle of the cone over the outer one.
     """
 
-    centre: Float[np.ndarray, "3"]
-    direction: Float[np.ndarray, "3"]
+    centre: Vector
+    direction: Vector
     inverse: float
     aim: Float[np.ndarray, "2"]
     radius: float | None = None
     inner_share: float = 0.7
 
     @property
-    def place(self) -> Float[np.ndarray, "3"]:
-        """Of the lamp [m]."""
+    def place(self) -> Vector:
+        """Position of the lamp [m]."""
         return self.centre + self.direction / self.inverse
 
     @property
-    def aim_point(self) -> Float[np.ndarray, "3"]:
-        """What it looks at [m]."""
+    def aim_point(self) -> Vector:
+        """Point that it looks at [m]."""
         return self.centre + np.array([*self.aim, 0.0])
 
     @property
@@ -493,11 +480,11 @@ class LampShape:
 
     @property
     def count(self) -> int:
-        """Of the numbers that it has."""
+        """Number of its parameters."""
         return PLACE_NUMBERS if self.radius is None else len(STEPS)
 
     def moved(self, x: Float[np.ndarray, "count"], *, above_table: bool) -> LampShape:
-        """Another lamp nearby.
+        """Return another lamp nearby.
 
         Args:
             x: two steps of the direction [rad], of the inverse distance [1/m], of the aim [m], of the radius's
@@ -517,8 +504,8 @@ class LampShape:
         share = float(np.clip(self.inner_share + x[6], *_SHARES))
         return LampShape(self.centre, direction, inverse, self.aim + x[3:5], radius, share)
 
-    def unshaded(self, pixels: LitPixels) -> Float[np.ndarray, "P"]:
-        """Share of the light that falls on each pixel past no object; 1 on one at the centre that faces the lamp."""
+    def unshaded(self, pixels: LitPixels) -> PerPixel:
+        """Return the share of light on each pixel without shadows; 1 on one at the centre that faces the lamp."""
         way = self.place - pixels.points
         squared = np.einsum("ij,ij->i", way, way)
         along = np.einsum("ij,ij->i", way, pixels.normals)
@@ -542,7 +529,6 @@ class LampShape:
 # the table may vary smoothly, as a quadratic of the place: shadows and cones speak for lamps, vignetting does not.
 
 
-RIDGE = 0.05  # of the harmonics: a lamp explains a gradient rather than they
 _TINY = 1e-9
 _TABLE_SCALE_M = 0.4
 _LEAST_SHARE = 0.05  # of the median radiance
@@ -559,69 +545,14 @@ class Gains:
         gradient: b of them, mean over views and colours.
     """
 
-    residual: Float[np.ndarray, "P 3"]
+    residual: Vectors
     lamp: Float[np.ndarray, "views 3"]
     ambient: Float[np.ndarray, "views 3"]
-    gradient: Float[np.ndarray, "3"]
+    gradient: Vector
 
 
-class GainSolver:
-    """Least squares of the light's linear part.
-
-    Args:
-        pixels: of one scene.
-    """
-
-    def __init__(self, pixels: LitPixels) -> None:
-        self._pixels = pixels
-        self._views = int(pixels.view.max()) + 1
-        table, views = pixels.on_table, range(self._views)
-        self._tables = [found for v in views if len(found := np.flatnonzero(table & (pixels.view == v)))]
-        self._objects = [(v, found) for v in views if len(found := np.flatnonzero(~table & (pixels.view == v)))]
-
-    def __call__(self, share: Float[np.ndarray, "P"] | None, weights: Float[np.ndarray, "P"]) -> Gains:
-        """The light and what it leaves, for the lamp's share of light on each pixel; without a lamp for None."""
-        radiance = self._pixels.radiance
-        residual = np.empty_like(radiance)
-        lamp, ambient = np.full((2, self._views, 3), np.nan)
-        gradients = [np.zeros(3)]
-        for view, chosen in self._objects:
-            light = self._on_objects(chosen, None if share is None else share[chosen], weights[chosen], residual)
-            ambient[view], lamp[view] = light[:, 0], light[:, 4] if share is not None else 0.0
-            gradients.append(light[:, 1:4].mean(axis=0))
-        for chosen in self._tables:
-            if share is None:
-                lit = smooth_light(self._pixels.points[chosen], radiance[chosen], weights[chosen])
-            else:
-                lit = _table_light(share[chosen], radiance[chosen], weights[chosen])
-            residual[chosen] = radiance[chosen] - lit
-        return Gains(residual, lamp, ambient, np.mean(gradients[1:] or gradients, axis=0))
-
-    def _on_objects(
-        self, chosen: np.ndarray, share: np.ndarray | None, weights: np.ndarray, residual: np.ndarray
-    ) -> Float[np.ndarray, "3 K"]:
-        """The light of objects in one view; writes the residual."""
-        pixels = self._pixels
-        plain = np.column_stack([np.ones(len(chosen)), pixels.normals[chosen]])
-        lit = plain if share is None else np.column_stack([plain, share])
-        light = np.zeros((3, 5 if share is not None else 4))
-        for c in range(3):
-            albedo, target = pixels.albedo[chosen, c], pixels.radiance[chosen, c]
-            found = _ridge(lit, albedo, target, weights, 0.0 if share is None else RIDGE)
-            if share is not None and found[4] < 0:
-                found = np.append(_ridge(plain, albedo, target, weights, 0.0), 0.0)
-            light[c] = found
-            residual[chosen, c] = target - albedo * (lit @ found)
-        return light
-
-
-def smooth_light(
-    points: Float[np.ndarray, "P 3"],
-    radiance: Float[np.ndarray, "P C"],
-    weights: Float[np.ndarray, "P"],
-    visible: Float[np.ndarray, "P"] | None = None,
-) -> Float[np.ndarray, "P C"]:
-    """The quadratic of x and y that fits the table's radiance best; with visibility, a constant and that times it."""
+def smooth_light(points: Vectors, radiance: Colours, weights: PerPixel, visible: PerPixel | None = None) -> Colours:
+    """Fit the table's radiance by a quadratic of x and y; with visibility, by a constant and a quadratic times it."""
     x, y = ((points[:, :2] - points[:, :2].mean(axis=0)) / _TABLE_SCALE_M).T
     basis = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     if visible is not None:
@@ -632,10 +563,8 @@ def smooth_light(
     return basis @ np.linalg.solve(normal, weighted.T @ radiance)
 
 
-def _table_light(
-    share: Float[np.ndarray, "P"], radiance: Float[np.ndarray, "P C"], weights: Float[np.ndarray, "P"]
-) -> Float[np.ndarray, "P C"]:
-    """A + K s that fits radiance best, neither negative."""
+def _table_light(share: PerPixel, radiance: Colours, weights: PerPixel) -> Colours:
+    """Fit radiance by A + K s, neither negative."""
     total = max(float(weights.sum()), _TINY)
     mean = weights @ radiance / total
     middle = float(weights @ share) / total
@@ -656,21 +585,6 @@ def _ridge(
     normal[np.diag_indices(len(normal))] += _TINY * scale
     normal[[1, 2, 3], [1, 2, 3]] += ridge * scale
     return np.linalg.solve(normal, weighted.T @ target)
-
-
-def spread(
-    residual: Float[np.ndarray, "P C"], pixels: LitPixels
-) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """Root mean square of each pixel's residual and its usual size, that of objects and of the table apart.
-
-    The usual size is at least a share of the radiance: on a plain table a shadow is no outlier by its contrast alone.
-    """
-    size, usual = np.sqrt((residual**2).mean(axis=1)), np.empty(len(residual))
-    for part in (pixels.on_table, ~pixels.on_table):
-        if part.any():
-            least = _LEAST_SHARE * float(np.median(pixels.radiance[part].mean(axis=1)))
-            usual[part] = max(1.4826 * float(np.median(size[part])), least, _LEAST_STD)
-    return size, usual
 
 
 # Where a lamp may stand: costs of lamps on some pixels, the comparison of all directions, refinement of one.
@@ -695,7 +609,7 @@ class Refined:
     """
 
     lamp: LampShape
-    residual: Float[np.ndarray, "P 3"]
+    residual: Vectors
     jacobian: Float[np.ndarray, "P 3 count"]
 
 
@@ -708,60 +622,98 @@ class LampSearch:
 
     def __init__(self, pixels: LitPixels) -> None:
         self.pixels = pixels
-        self._table, self._lifted, self._solver = pixels.on_table, pixels.lifted(), GainSolver(pixels)
+        self._table, self._lifted = pixels.on_table, pixels.lifted()
         self.is_on_table = bool(self._table.any())
         """Whether the plane z = 0 is seen, so that the lamp is above it."""
+        views = range(int(pixels.view.max()) + 1)
+        chosen = [[np.flatnonzero(part & (pixels.view == v)) for v in views] for part in (~self._table, self._table)]
+        self._objects_by_view, self._table_by_view = chosen
 
-    def visible(self, lamp: LampShape) -> Float[np.ndarray, "P"]:
-        """Share of the lamp that each pixel sees."""
+    def visible(self, lamp: LampShape) -> PerPixel:
+        """Return the share of the lamp that each pixel sees."""
         return self.pixels.shadows.from_place(lamp.place, self._lifted)
 
-    def gains(
-        self, lamp: LampShape | None, weights: Float[np.ndarray, "P"], visible: Float[np.ndarray, "P"] | None = None
-    ) -> Gains:
-        """The light under a lamp, or without one; `visible` if that is known already."""
-        if lamp is None:
-            return self._solver(None, weights)
-        visible = self.visible(lamp) if visible is None else visible
-        return self._solver(lamp.unshaded(self.pixels) * visible, weights)
+    def gains(self, lamp: LampShape | None, weights: PerPixel, visible: PerPixel | None = None) -> Gains:
+        """Fit the light under a lamp, or without one; `visible` if that is known already."""
+        share = None
+        if lamp is not None:
+            share = lamp.unshaded(self.pixels) * (self.visible(lamp) if visible is None else visible)
+        radiance = self.pixels.radiance
+        residual = np.empty_like(radiance)
+        fitted, ambient = np.full((2, len(self._objects_by_view), 3), np.nan)
+        gradients = []
+        for view, chosen in enumerate(self._objects_by_view):
+            if len(chosen):
+                light = self._on_objects(chosen, None if share is None else share[chosen], weights[chosen], residual)
+                ambient[view], fitted[view] = light[:, 0], light[:, 4] if share is not None else 0.0
+                gradients.append(light[:, 1:4].mean(axis=0))
+        for chosen in self._table_by_view:
+            if not len(chosen):
+                continue
+            if share is None:
+                lit = smooth_light(self.pixels.points[chosen], radiance[chosen], weights[chosen])
+            else:
+                lit = _table_light(share[chosen], radiance[chosen], weights[chosen])
+            residual[chosen] = radiance[chosen] - lit
+        return Gains(residual, fitted, ambient, np.mean(gradients or [np.zeros(3)], axis=0))
 
-    def cost(self, residual: Float[np.ndarray, "P C"]) -> float:
-        """Logarithms of the mean absolute residual of objects and table, weighted by their pixels."""
+    def _on_objects(
+        self, chosen: np.ndarray, share: np.ndarray | None, weights: np.ndarray, residual: np.ndarray
+    ) -> Float[np.ndarray, "3 K"]:
+        """Fit the light of objects in one view; write the residual."""
+        plain = np.column_stack([np.ones(len(chosen)), self.pixels.normals[chosen]])
+        lit = plain if share is None else np.column_stack([plain, share])
+        light = np.zeros((3, lit.shape[1]))
+        for c in range(3):
+            albedo, target = self.pixels.albedo[chosen, c], self.pixels.radiance[chosen, c]
+            found = _ridge(lit, albedo, target, weights, 0.0 if share is None else _RIDGE)
+            if share is not None and found[4] < 0:
+                found = np.append(_ridge(plain, albedo, target, weights, 0.0), 0.0)
+            light[c] = found
+            residual[chosen, c] = target - albedo * (lit @ found)
+        return light
+
+    def cost(self, residual: Colours) -> float:
+        """Return the logarithms of the mean absolute residual of objects and table, weighted by their pixels."""
         size = np.abs(residual).mean(axis=1)
         parts = [part for part in (self._table, ~self._table) if part.any()]
         return sum(float(part.mean() * np.log(size[part].mean() + 1e-6)) for part in parts)
 
-    def weights(self, residual: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P"]:
-        """As of absolute errors, which shadows that are still misplaced do not lose, over variances."""
-        size, usual = spread(residual, self.pixels)
+    def weights(self, residual: Vectors) -> PerPixel:
+        """Return weights as of absolute errors, by which misplaced shadows still count, over variances.
+
+        The usual error, of objects and of the table apart, is at least a share of the radiance: on a plain table a
+        shadow is no outlier by its contrast alone.
+        """
+        size, usual = np.sqrt((residual**2).mean(axis=1)), np.empty(len(residual))
+        for part in (self._table, ~self._table):
+            if part.any():
+                least = _LEAST_SHARE * float(np.median(self.pixels.radiance[part].mean(axis=1)))
+                usual[part] = max(1.4826 * float(np.median(size[part])), least, _LEAST_STD)
         return 1 / np.sqrt(1 + (size / usual) ** 2) / usual**2
 
-    def by_direction(self, centre: Float[np.ndarray, "3"]) -> list[LampShape]:
-        """Lamps without a cone in all directions, the best first; see `ranked`.
-
-        Args:
-            centre: what directions and distances are told from [m].
-        """
+    def by_direction(self, centre: Vector) -> list[LampShape]:
+        """Return lamps without a cone in all directions from a centre [m], the best first; see `ranked`."""
         directions = fibonacci_sphere(_SEARCH_DIRECTIONS)
         if self.is_on_table:
             directions = directions[directions[:, 2] > _SEARCH_LEAST_HEIGHT]
         return self.ranked([LampShape(centre, d, q, np.zeros(2)) for d in directions for q in _SEARCH_INVERSES])
 
     def around(self, lamps: Sequence[LampShape]) -> list[LampShape]:
-        """Lamps without a cone near some, at several distances, the best first; see `ranked`."""
+        """Return lamps without a cone near some, at several distances, the best first; see `ranked`."""
         angles = np.linspace(0, 2 * np.pi, _RING, endpoint=False)
         steps = [(0.0, 0.0), *((r * np.cos(a), r * np.sin(a)) for r in _RINGS_RAD for a in angles)]
         near = [lamp.moved(np.array([*step, 0.0]), above_table=self.is_on_table) for lamp in lamps for step in steps]
         return self.ranked([replace(lamp, inverse=q) for lamp in near for q in _FINE_INVERSES])
 
     def ranked(self, lamps: Sequence[LampShape]) -> list[LampShape]:
-        """The best first; the table's brightness may vary smoothly, so that its shadows count and no cone matters."""
+        """Sort lamps, the best first; the table's brightness may vary smoothly: shadows count and no cone matters."""
         grey, albedo = self._normalised(), self.pixels.albedo.mean(axis=1)
         costs = [self.cost(self._left_over(lamp, grey, albedo)) for lamp in lamps]
         return [lamps[k] for k in np.argsort(costs, kind="stable")]
 
-    def refine(self, lamp: LampShape, weights: Float[np.ndarray, "P"], scale: float = 1.0) -> Refined:
-        """Levenberg-Marquardt from a lamp, with central differences over `STEPS` times a scale."""
+    def refine(self, lamp: LampShape, weights: PerPixel, scale: float = 1.0) -> Refined:
+        """Refine a lamp by Levenberg and Marquardt's method, with central differences over `STEPS` times a scale."""
         steps, root = scale * STEPS[: lamp.count], np.sqrt(weights)[:, None]
 
         def cost(x: np.ndarray) -> np.ndarray:
@@ -778,7 +730,7 @@ class LampSearch:
         return Refined(moved, found.fun.reshape(shape), found.jac.reshape(*shape, -1) / scale)
 
     def _normalised(self) -> Float[np.ndarray, "P 1"]:
-        """Radiance, mean of the colours, such that views have about the same exposure."""
+        """Return radiance, mean of the colours, such that views have about the same exposure."""
         grey, albedo = self.pixels.radiance.mean(axis=1), self.pixels.albedo.mean(axis=1)
         for view in np.unique(self.pixels.view):
             for part in (self._table, ~self._table):
@@ -787,10 +739,8 @@ class LampSearch:
                     grey[chosen] /= max(float(np.median(grey[chosen] / np.maximum(albedo[chosen], 1e-3))), 1e-6)
         return grey[:, None]
 
-    def _left_over(
-        self, lamp: LampShape, grey: Float[np.ndarray, "P 1"], albedo: Float[np.ndarray, "P"]
-    ) -> Float[np.ndarray, "P 1"]:
-        """What a lamp does not explain of such radiance."""
+    def _left_over(self, lamp: LampShape, grey: Float[np.ndarray, "P 1"], albedo: PerPixel) -> Float[np.ndarray, "P 1"]:
+        """Return what a lamp does not explain of such radiance."""
         visible, objects = self.visible(lamp), ~self._table
         left = np.zeros_like(grey)
         if objects.any():
@@ -798,7 +748,7 @@ class LampSearch:
             plain = np.column_stack([np.ones(len(share)), self.pixels.normals[objects], share])
             basis = plain * albedo[objects, None]
             normal = basis.T @ basis + 1e-6 * np.eye(5)
-            normal[[1, 2, 3], [1, 2, 3]] += RIDGE * normal[0, 0]
+            normal[[1, 2, 3], [1, 2, 3]] += _RIDGE * normal[0, 0]
             light = np.linalg.solve(normal, basis.T @ grey[objects])
             light[4] = np.maximum(light[4], 0)
             left[objects] = grey[objects] - basis @ light
@@ -810,7 +760,7 @@ class LampSearch:
 
 
 def apart(lamps: Sequence[LampShape], count: int, angle_rad: float) -> list[LampShape]:
-    """The first so many lamps, none within an angle of another."""
+    """Return the first so many lamps, none within an angle of another."""
     kept: list[LampShape] = []
     for lamp in lamps:
         if len(kept) < count and all(lamp.direction @ other.direction < np.cos(angle_rad) for other in kept):
@@ -821,7 +771,7 @@ def apart(lamps: Sequence[LampShape], count: int, angle_rad: float) -> list[Lamp
 # A lamp at a finite distance, from photographs of known objects and of the table around them.
 #
 # Its share of light on each pixel (`LampShape`) is searched, everything else about the light is linear
-# (`GainSolver`). Directions are compared first, by the shadows that they cast and by shading, with a table whose
+# (`Gains`). Directions are compared first, by the shadows that they cast and by shading, with a table whose
 # brightness may vary smoothly as it likes; then distances and cones, for the best of them; Levenberg-Marquardt
 # refines what fits best, with weights as of absolute errors. Deviations come from the curvature of the residuals,
 # those of one patch of a surface taken as one observation, since errors of albedo and normals are alike within a
@@ -867,23 +817,23 @@ class NearLampFit:
     is_diffuse: bool
 
     @property
-    def direction(self) -> Float[np.ndarray, "3"]:
+    def direction(self) -> Vector:
         """Unit vector from the centre toward the lamp."""
         return self.shape.direction
 
     @property
     def distance(self) -> float:
-        """From the centre [m]; it means little if it is not known."""
+        """Distance from the centre [m]; it means little if it is not known."""
         return 1 / self.shape.inverse
 
     @property
     def distance_known(self) -> bool:
-        """Whether the photographs tell the distance."""
+        """Whether the photographs determine the distance."""
         return not self.is_diffuse and self.log_distance_std < _MOST_LOG_STD
 
     @property
     def lamp(self) -> SpotLamp | None:
-        """The lamp over the table, as renderers take it; None if its distance is not known, or it is too near or low.
+        """Return the lamp over the table for renderers; None if its distance is not known, or it is too near or low.
 
         Without a cone in the photographs, it has a wide one.
         """
@@ -896,15 +846,15 @@ class NearLampFit:
         return SpotLamp(place, self.shape.aim_point, float(inner), float(outer))
 
 
-def fit_near_lamp(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> NearLampFit:
+def fit_near_lamp(pixels: LitPixels, centre: Vector) -> NearLampFit:
     """Find the lamp.
 
     Args:
         pixels: of all photographs of one scene.
-        centre: what its direction and distance are told from [m], such as the table's centre.
+        centre: from which its direction and distance are counted [m], such as the table's centre.
     """
     start = _start(pixels, centre)
-    search = LampSearch(_about(pixels, _FINE_PIXELS))
+    search = LampSearch(pixels.about(_FINE_PIXELS))
     weights = np.ones(len(search.pixels.radiance))
     weights = search.weights(search.gains(start, weights).residual)
     found = search.refine(start, weights)
@@ -915,34 +865,25 @@ def fit_near_lamp(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> NearLamp
     std = float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2 + _POSE_STD_RAD**2))
     log_std = float(np.sqrt(covariance[2, 2] + _POSE_STD_PER_M**2)) / found.lamp.inverse
     under, without = search.gains(found.lamp, weights), search.gains(None, weights)
-    left = [float((weights[:, None] * g.residual**2).sum()) for g in (under, without)]
-    gain = 1 - left[0] / max(left[1], 1e-12)
+    gain = _gain(under.residual, without.residual, weights)
     is_diffuse = _is_diffuse(gain, under, without, on_table=search.is_on_table)
     return NearLampFit(found.lamp, std, log_std, under.lamp, under.ambient, gain, is_diffuse)
 
 
 def _is_diffuse(gain: float, under: Gains, without: Gains, *, on_table: bool) -> bool:
-    """Whether light without a lamp explains as much; objects alone must show that it is no more directed than a room's.
-
-    On a table, a lamp casts shadows that nothing else explains.
-    """
+    """Return whether nothing speaks for a lamp, such as shadows on a table, which nothing else explains."""
     if not np.nanmax(under.lamp, initial=0.0) > 0:
         return True
     if on_table:
         return gain <= _LEAST_TABLE_GAIN
-    directed = np.linalg.norm(without.gradient) > _MOST_DIRECTED * max(float(np.nanmean(without.ambient)), 0.0)
-    return not (directed or gain > _LEAST_GAIN)
+    return not _speaks_for_lamp(gain, without.gradient, float(np.nanmean(without.ambient)))
 
 
-def _about(pixels: LitPixels, count: int) -> LitPixels:
-    return pixels.every(max(len(pixels.radiance) // count, 1))
-
-
-def _start(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> LampShape:
-    """The best lamp on few pixels."""
-    coarse = LampSearch(_about(pixels, _COARSE_PIXELS))
+def _start(pixels: LitPixels, centre: Vector) -> LampShape:
+    """Find the best lamp on few pixels."""
+    coarse = LampSearch(pixels.about(_COARSE_PIXELS))
     directions = coarse.around(apart(coarse.by_direction(centre), _STARTS, _APART_RAD))
-    search = LampSearch(_about(pixels, _MIDDLE_PIXELS))
+    search = LampSearch(pixels.about(_MIDDLE_PIXELS))
     flat = search.weights(search.gains(None, np.ones(len(search.pixels.radiance))).residual)
     starts = _with_cones(search, apart(directions, _STARTS, _APART_RAD), flat)
     tried = [*starts[:_REFINED], next(lamp for lamp in starts if lamp.radius is None)]
@@ -958,7 +899,7 @@ def _start(pixels: LitPixels, centre: Float[np.ndarray, "3"]) -> LampShape:
 
 
 def _with_cones(search: LampSearch, lamps: Sequence[LampShape], weights: np.ndarray) -> list[LampShape]:
-    """Lamps at several distances and with several cones, the best first."""
+    """Return lamps at several distances and with several cones, the best first."""
     costs, tried = [], []
     for lamp in (replace(lamp, inverse=inverse) for lamp in lamps for inverse in _INVERSES):
         visible = search.visible(lamp)
@@ -969,7 +910,7 @@ def _with_cones(search: LampSearch, lamps: Sequence[LampShape], weights: np.ndar
 
 
 def _covariance(found: Refined, pixels: LitPixels) -> Float[np.ndarray, "count count"]:
-    """Of the lamp's numbers, in their units: H^-1 (sum of g g^T over patches) H^-1, g the gradient from one patch."""
+    """Return the covariance of the lamp's parameters: H^-1 (sum of g g^T over patches) H^-1, g a patch's gradient."""
     count = found.lamp.count
     curvature = np.einsum("pci,pcj->ij", found.jacobian, found.jacobian)
     curvature += np.diag((STEPS[:count] / _PRIOR_STD[:count]) ** 2)
@@ -985,7 +926,7 @@ def _covariance(found: Refined, pixels: LitPixels) -> Float[np.ndarray, "count c
 
 
 def photo_light(photo: Photograph, objects: Sequence[PhotoObject], surfels: Sequence[Surfels]) -> LampFit:
-    """Direction toward a distant lamp in the world, from the shading of all objects and the shadows between them.
+    """Find the direction toward a distant lamp in the world, from the objects' shading and the shadows between them.
 
     Args:
         photo: with masks of the objects.
@@ -995,16 +936,16 @@ def photo_light(photo: Photograph, objects: Sequence[PhotoObject], surfels: Sequ
     Raises:
         InvalidInput: if too few pixels show objects that are trusted.
     """
-    columns = [[np.zeros((0, 3))] for _ in range(4)]
-    for found, points in zip(objects, surfels, strict=True):
-        if found.name in photo.masks:
-            for column, values in zip(columns, object_pixels(photo, found.name, found.best.pose, points), strict=True):
-                column.append(values)
-    radiance, albedo, points, normals = (np.concatenate(column) for column in columns)
+    seen = [
+        object_pixels(photo, found.name, found.best.pose, its)
+        for found, its in zip(objects, surfels, strict=True)
+        if found.name in photo.masks
+    ]
+    radiance, albedo, points, normals = _joined(seen)
     shadows = Shadows(surfels, [found.best.pose for found in objects])
     lifted = shadows.lifted(points, normals)
 
-    def visible(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "P"]:
+    def visible(direction: Vector) -> PerPixel:
         return shadows.from_direction(direction, lifted)
 
     return fit_lamp(ShadedPixels(radiance, albedo, normals), visible)
@@ -1017,9 +958,9 @@ def photo_lamp(
     *,
     covered_m: tuple[float, float] | None = None,
 ) -> NearLampFit:
-    """The lamp and its place, from objects, the shadows that they cast and the table where that is known.
+    """Find the lamp and its place, from objects, the shadows that they cast and the table where that is known.
 
-    Its direction and distance are told from the world's origin on a known table, else from the objects' centre.
+    Its direction and distance are counted from the world's origin on a known table, else from the objects' centre.
 
     Args:
         photos: of one scene, with masks of the objects.

@@ -15,7 +15,7 @@ from osfcore.geometry.poses import Pose
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Photograph:
-    """What one photo tells.
+    """Radiance, camera and masks of one photo.
 
     Attributes:
         image: linear radiance in [0, 1].
@@ -54,16 +54,16 @@ class Photograph:
 
     @property
     def height(self) -> int:
-        """Of the image [px]."""
+        """Height of the image [px]."""
         return self.image.shape[0]
 
     @property
     def width(self) -> int:
-        """Of the image [px]."""
+        """Width of the image [px]."""
         return self.image.shape[1]
 
     def with_masks(self, masks: Mapping[str, Bool[np.ndarray, "h w"]]) -> Photograph:
-        """The same photograph with other masks.
+        """Return the same photograph with other masks.
 
         Raises:
             InvalidInput: if a mask has another size than the image, or is empty.
@@ -71,7 +71,7 @@ class Photograph:
         return replace(self, masks=dict(masks))
 
     def resized(self, longest: int) -> Photograph:
-        """The same view with fewer pixels; one that is small enough already stays as it is.
+        """Return the same view with fewer pixels; one that is small enough already stays as it is.
 
         Radiance is averaged over the area of each new pixel. A new pixel belongs to a mask if more than half of its
         area does, and is well exposed only if all of its area is.

@@ -15,12 +15,19 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.objective import RestingOrientations, fibonacci_sphere
+from osfcore.estimation.objective import RestingOrientations
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.kiloosf_query import KiloQuery
 from osfcore.fields.rays import ONE_AT_A_TIME, march
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.poses import Pose, orthogonal_basis, quaternion_conjugate, quaternion_to_matrix, rotate
+from osfcore.geometry.poses import (
+    Pose,
+    fibonacci_sphere,
+    orthogonal_basis,
+    quaternion_conjugate,
+    quaternion_to_matrix,
+    rotate,
+)
 from osfcore.photo.photograph import Photograph
 
 # Compiled comparison of an object's surfels in many poses with one photograph.
@@ -306,13 +313,13 @@ def surfels_of(field: KiloOSF, spacing: float) -> Surfels:
 
 
 def _means(values: np.ndarray, number: np.ndarray, count: int) -> Float32[np.ndarray, "S 3"]:
-    """Mean of the values of each cell."""
+    """Return the mean of the values of each cell."""
     sums = np.stack([np.bincount(number, column, count) for column in values.T], axis=1)
     return (sums / np.bincount(number, minlength=count)[:, None]).astype(np.float32)
 
 
 def _seen_from(field: KiloOSF, direction: np.ndarray, centre: np.ndarray, radius: float, step: float) -> np.ndarray:
-    """Points where parallel rays along -direction have lost half of their light [m]."""
+    """Find points where parallel rays along -direction have lost half of their light [m]."""
     right, up = orthogonal_basis(direction)
     line = np.arange(-radius, radius, step)
     a, b = np.meshgrid(line, line, indexing="ij")
@@ -329,7 +336,7 @@ def _seen_from(field: KiloOSF, direction: np.ndarray, centre: np.ndarray, radius
 
 
 def _appearance(field: KiloOSF, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normals and albedos at points."""
+    """Return the field's normals and albedos at points."""
     query = KiloQuery(field)
     with torch.no_grad():
         x = torch.as_tensor(points)
@@ -340,7 +347,7 @@ def _appearance(field: KiloOSF, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _smoothed(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Unit normals, each the mean of those of its nearest neighbours."""
+    """Return unit normals, each the mean of those of its nearest neighbours."""
     unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     _, near = KDTree(points).query(points, k=_NEIGHBOURS)
     mean = unit[near].mean(axis=1)
@@ -371,7 +378,7 @@ class WindowFrame:
     height: int
 
     def cut(self, array: Float32[np.ndarray, "h w *colours"], outside: float = 0.0) -> Float32[np.ndarray, "*window"]:
-        """That part of an image, averaged over areas; `outside` beyond the photograph."""
+        """Return that part of an image, averaged over areas; `outside` beyond the photograph."""
         high, wide = array.shape[:2]
         inner = array[max(self.top, 0) : self.bottom, max(self.left, 0) : self.right]
         border = max(-self.top, 0), max(self.bottom - high, 0), max(-self.left, 0), max(self.right - wide, 0)
@@ -379,11 +386,20 @@ class WindowFrame:
         return cv2.resize(whole, (self.width, self.height), interpolation=cv2.INTER_AREA)
 
     def intrinsics(self, photo: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-        """Of the window's camera, from the photograph's [px]."""
+        """Return K of the window's camera, from the photograph's [px]."""
         moved = photo.copy()
         moved[:2, 2] -= self.left, self.top
         scale = [[self.width / (self.right - self.left)], [self.height / (self.bottom - self.top)], [1.0]]
         return moved * np.array(scale)
+
+    def placed(self, drawn: Bool[np.ndarray, "a b"], shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
+        """Return a window's pixels in the whole photograph: the inverse of `cut`."""
+        whole = cv2.resize(drawn.astype(np.float32), (self.right - self.left, self.bottom - self.top)) > 0.5
+        top, left = max(self.top, 0), max(self.left, 0)
+        bottom, right = min(self.bottom, shape[0]), min(self.right, shape[1])
+        placed = np.zeros(shape, bool)
+        placed[top:bottom, left:right] = whole[top - self.top : bottom - self.top, left - self.left : right - self.left]
+        return placed
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -394,7 +410,7 @@ class ObjectWindow:
         image: linear radiance.
         luminance: its mean over colours.
         mask: pixels of the object.
-        known: pixels of which the mask tells whether they show the object: none that another object may hide, and none
+        known: pixels of which the mask decides whether they show the object: none that another object may hide, none
             outside the photograph.
         plain: well exposed pixels within the mask, one pixel away from its border.
         signed_distance: to the mask's border, positive inside [px].
@@ -423,7 +439,7 @@ class ObjectWindow:
 
     @property
     def centroid(self) -> Float[np.ndarray, "2"]:
-        """Of the mask (x, y) [px]."""
+        """Centroid of the mask (x, y) [px]."""
         rows, columns = np.nonzero(self.mask)
         return np.array([columns.mean(), rows.mean()]) + 0.5
 
@@ -434,7 +450,7 @@ class ObjectWindow:
 
 
 def object_windows(photos: Sequence[Photograph], name: str, side: int) -> tuple[ObjectWindow, ...]:
-    """A window of each photograph with a mask of the object.
+    """Cut a window out of each photograph with a mask of the object.
 
     Args:
         photos: of one scene.
@@ -498,12 +514,12 @@ def _share_cut(mask: Bool[np.ndarray, "h w"]) -> float:
 
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Distance from each pixel's centre to the border of a mask, positive inside [px]."""
+    """Return the distance from each pixel's centre to the border of a mask, positive inside [px]."""
     inside, outside = np.asarray(distance_transform_edt(mask)), np.asarray(distance_transform_edt(~mask))
     return np.where(mask, inside - 0.5, 0.5 - outside).astype(np.float32)
 
 
-# What a known table tells of an object's pose: it probably stands on it, in one of its stable orientations.
+# Prior on an object's pose over a known table: it probably stands on it, in one of its stable orientations.
 
 
 _HEIGHT_STD_M = 2e-3
@@ -527,15 +543,15 @@ class TablePrior:
         self._stable = np.unique(np.round(rotate(quaternion_conjugate(resting.quaternions), _DOWN), 6), axis=0)
 
     def downs(self, pose: Pose) -> Float[np.ndarray, "K 3"]:
-        """Directions, in the pose's outer frame, one of which is down if the object stands in a stable orientation."""
+        """Return directions in the pose's outer frame, one of which is down if the object stands stably."""
         return rotate(pose.quaternion, self._stable)
 
     def extent(self, pose: Pose, direction: Float[np.ndarray, "3"]) -> float:
-        """How far the object reaches along a direction, from the outer frame's origin [m]."""
+        """Return how far the object reaches along a direction, from the outer frame's origin [m]."""
         return float((pose.apply(self._hull) @ direction).max())
 
     def penalties(self, poses: Pose) -> Float[np.ndarray, "B"]:
-        """Squared deviations of B poses, each of the two at most 100."""
+        """Return squared deviations of B poses, each of the two at most 100."""
         lowest = rotate(poses.quaternion[:, None], self._hull)[..., 2].min(axis=1) + poses.position[:, 2]
         cosines = (rotate(poses.quaternion[:, None], self._stable) @ _DOWN).max(axis=1)
         heights = np.abs(lowest) / _HEIGHT_STD_M
@@ -605,7 +621,7 @@ class PoseLoss:
     Args:
         windows: of the photographs.
         surfels: of the object.
-        table: what a known table tells; None where it is not known.
+        table: prior of the known table; None where it is not known.
         kind: "all", or "iou" for the outline alone, as in the paper.
     """
 
@@ -620,11 +636,11 @@ class PoseLoss:
         self.windows, self.surfels, self.table, self.kind = tuple(windows), surfels, table, kind
 
     def __call__(self, poses: Pose) -> Float[np.ndarray, "B"]:
-        """Losses of B poses."""
+        """Compute the losses of B poses."""
         return self.terms(poses).losses
 
     def terms(self, poses: Pose) -> PoseTerms:
-        """Losses of B poses and what they consist of."""
+        """Compute the losses of B poses and their parts."""
         found = np.mean([_compare(self.surfels, window, poses) for window in self.windows], axis=0)
         few = found[:, 3] < _LEAST_COMPARED
         residual, correlation = np.where(few, 1.0, found[:, 1]), np.where(few, 0.0, found[:, 2])
@@ -639,33 +655,40 @@ class PoseLoss:
 def draw(
     surfels: Surfels, window: ObjectWindow, poses: Pose
 ) -> tuple[Int32[np.ndarray, "B h w"], Float32[np.ndarray, "B h w"]]:
-    """The number of the surfel that each pixel of a window shows, -1 where none, and its depth along z [m]."""
+    """Draw which surfel each pixel of a window shows, -1 for none, and its depth along z [m]."""
     local = window.T_camera_world @ poses
     index = np.empty((len(poses.position), *window.size), np.int32)
     depth = np.empty(index.shape, np.float32)
     with ONE_AT_A_TIME:
         draw_poses(
-            surfels.points, surfels.normals, _half(surfels), *_numbers(local), lens(window.intrinsics), depth, index
+            surfels.points,
+            surfels.normals,
+            _half(surfels),
+            *rotation_and_position(local),
+            lens(window.intrinsics),
+            depth,
+            index,
         )
     return index, depth
 
 
 def lens(intrinsics: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "4"]:
-    """Focal lengths and principal point for compiled code."""
+    """Return focal lengths and principal point for compiled code."""
     return intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
 
 
 def _compare(surfels: Surfels, window: ObjectWindow, poses: Pose) -> Float[np.ndarray, "B 4"]:
     terms = np.empty((len(poses.position), TERMS))
     mask, known, plain = (np.ascontiguousarray(a).view(np.uint8) for a in (window.mask, window.known, window.plain))
-    rotations, positions = _numbers(window.T_camera_world @ poses)
+    rotations, positions = rotation_and_position(window.T_camera_world @ poses)
     with ONE_AT_A_TIME:
         compare_poses(surfels.points, surfels.normals, surfels.albedo, _half(surfels), rotations, positions,
                       lens(window.intrinsics), window.image, window.luminance, mask, known, plain, terms)  # fmt: skip
     return terms
 
 
-def _numbers(local: Pose) -> tuple[np.ndarray, np.ndarray]:
+def rotation_and_position(local: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses as single-precision matrices and positions for compiled code."""
     rotations = np.ascontiguousarray(quaternion_to_matrix(local.quaternion), np.float32)
     return rotations, np.ascontiguousarray(local.position, np.float32)
 

@@ -31,13 +31,14 @@ from osfcore.photo.pose_loss import (
     PoseLoss,
     Surfels,
     TablePrior,
-    WindowFrame,
     draw,
     object_windows,
     signed_distance,
     surfels_of,
 )
 from osfcore.progress import Progress
+
+Pair = tuple[np.ndarray, np.ndarray]
 
 # Gauss-Newton on the pose of one object: direct image alignment of its visible surfels, and its outline on the
 # mask's.
@@ -51,7 +52,7 @@ from osfcore.progress import Progress
 #     r_c = phi(u_c) - phi_drawn(u_c),                  d r_c / d xi = grad phi(u_c) . d u_c / d xi,
 #
 # phi and phi_drawn the signed distances to the borders of the mask and of the drawn outline. A mask whose border is
-# off by a constant is marginalised where the table tells how large an object appears. xi is a shift in the world
+# off by a constant is marginalised where the table fixes how large an object appears. xi is a shift in the world
 # and a turn about the object's origin. Which surfels are visible is found anew at each step and frozen within it.
 
 
@@ -67,7 +68,7 @@ _FEWEST = 30  # surfels for colours to count
 _REWEIGHTINGS = 2
 _WORSE = 0.15  # a loss that much above the first: it went astray
 _BORDER_STD_PX, _BORDER_STD_ON_TABLE_PX = 0.1, 2.0  # of a constant error of the mask's border
-_CORRELATED = 0.03  # share of independent residuals: what the table says counts against them
+_CORRELATED = 0.03  # share of independent residuals, against which the table's prior counts
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 _RIDGE = np.diag([1e-4, 2e-2, 2e-2, 2e-2])
 
@@ -78,8 +79,8 @@ class _Prepared:
 
     window: ObjectWindow
     blurred: Float[np.ndarray, "h w 3"]
-    gradient: tuple[np.ndarray, np.ndarray]  # along x and y
-    distance_gradient: tuple[np.ndarray, np.ndarray]
+    gradient: Pair  # along x and y
+    distance_gradient: Pair
     clear: Bool[np.ndarray, "h w"]
 
 
@@ -95,7 +96,7 @@ def align(loss: PoseLoss, start: Pose) -> tuple[Pose, float]:
         The pose and its loss.
     """
     prepared = [_prepare(window, loss.surfels, start) for window in loss.windows]
-    first = float(loss(_batch(start))[0])
+    first = float(loss(start[None])[0])
     pose, best, least, value = start, start, first, first
     for _ in range(_ITERATIONS):
         normal, right = _normal_equations(prepared, loss, pose)
@@ -105,16 +106,12 @@ def align(loss: PoseLoss, start: Pose) -> tuple[Pose, float]:
         shift *= min(1.0, _MOST_SHIFT * depth / max(float(np.linalg.norm(shift)), 1e-12))
         turn *= min(1.0, _MOST_TURN_RAD / max(float(np.linalg.norm(turn)), 1e-12))
         pose = Pose(pose.position + shift, quaternion_multiply(quaternion_exp(turn), pose.quaternion))
-        value = float(loss(_batch(pose))[0])
+        value = float(loss(pose[None])[0])
         if value < least:
             best, least = pose, value
         if np.linalg.norm(shift) < _LEAST_SHIFT * depth and np.linalg.norm(turn) < _LEAST_TURN_RAD:
             break
     return (pose, value) if value < first + _WORSE else (best, least)
-
-
-def _batch(pose: Pose) -> Pose:
-    return Pose(pose.position[None], pose.quaternion[None])
 
 
 def _prepare(window: ObjectWindow, surfels: Surfels, start: Pose) -> _Prepared:
@@ -127,15 +124,15 @@ def _prepare(window: ObjectWindow, surfels: Surfels, start: Pose) -> _Prepared:
     return _Prepared(window, blurred, _gradient(blurred), _gradient(phi), clear)
 
 
-def _gradient(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Along x and y [per px]."""
+def _gradient(image: np.ndarray) -> Pair:
+    """Return the derivatives along x and y [per px]."""
     return np.asarray(np.gradient(image, axis=1)), np.asarray(np.gradient(image, axis=0))
 
 
-def _normal_equations(prepared: list[_Prepared], loss: PoseLoss, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+def _normal_equations(prepared: list[_Prepared], loss: PoseLoss, pose: Pose) -> Pair:
     normal, right = np.zeros((6, 6)), np.zeros(6)
     for part in prepared:
-        index, _ = draw(loss.surfels, part.window, _batch(pose))
+        index, _ = draw(loss.surfels, part.window, pose[None])
         std = _BORDER_STD_PX if loss.table is None else _BORDER_STD_ON_TABLE_PX
         terms = [_outline_terms(part, loss.surfels, pose, index[0], std)]
         if loss.kind == "all":
@@ -150,7 +147,7 @@ def _normal_equations(prepared: list[_Prepared], loss: PoseLoss, pose: Pose) -> 
     return normal, right
 
 
-def _colour_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _colour_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray) -> Pair:
     normal, right = np.zeros((6, 6)), np.zeros(6)
     seen = np.unique(index[(index >= 0) & part.window.plain])
     pixels, jacobian = _project(part.window, pose, surfels.points[seen])
@@ -171,8 +168,8 @@ def _colour_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarr
     return normal, right
 
 
-def _robust_fit(shades: np.ndarray, observed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of the least-squares light, and their weights over variance by Tukey's biweight."""
+def _robust_fit(shades: np.ndarray, observed: np.ndarray) -> Pair:
+    """Return residuals of the least-squares light, and their weights over variance by Tukey's biweight."""
     residual, std = _light_residual(shades, observed, np.ones(len(observed)))
     for _ in range(_REWEIGHTINGS):
         residual, std = _light_residual(shades, observed, _tukey(residual, std))
@@ -180,7 +177,7 @@ def _robust_fit(shades: np.ndarray, observed: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _light_residual(shades: np.ndarray, observed: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
-    """Residuals under the light of weighted least squares, and their standard deviation by their median."""
+    """Return residuals of the light by weighted least squares, and their standard deviation by their median."""
     normal = (shades * weights[:, None]).T @ shades
     normal += _RIDGE * normal[0, 0] + 1e-9 * np.eye(len(normal))
     residual = observed - shades @ np.linalg.solve(normal, (shades * weights[:, None]).T @ observed)
@@ -191,10 +188,8 @@ def _tukey(residual: np.ndarray, std: float) -> np.ndarray:
     return (1 - np.minimum(np.abs(residual) / (_TUKEY * std), 1) ** 2) ** 2
 
 
-def _outline_terms(
-    part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray, border_std_px: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations of the outline; a border of the mask that is off by a constant is marginalised."""
+def _outline_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray, border_std_px: float) -> Pair:
+    """Return the outline's normal equations; a border of the mask that is off by a constant is marginalised."""
     shown = index >= 0
     border = shown & (cv2.erode(shown.astype(np.uint8), _CROSS) == 0) & part.clear
     pixels, jacobian = _project(part.window, pose, surfels.points[index[border]])
@@ -213,7 +208,7 @@ def _outline_terms(
 def _project(
     window: ObjectWindow, pose: Pose, points: Float[np.ndarray, "S 3"]
 ) -> tuple[Float[np.ndarray, "S 2"], Float[np.ndarray, "S 2 6"]]:
-    """Pixels of an object's points, and their derivatives by a shift in the world and a turn about its origin."""
+    """Project an object's points; also the derivatives by a shift in the world and a turn about its origin."""
     arms = points @ quaternion_to_matrix(pose.quaternion).T
     local = window.T_camera_world.apply(arms + pose.position)
     x, y, z = local.T
@@ -230,7 +225,7 @@ def _project(
 
 
 def _sample(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Bilinear values at pixel coordinates, whose centres are at +0.5."""
+    """Interpolate bilinearly at pixel coordinates, whose centres are at +0.5."""
     return map_coordinates(image, [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], order=1, mode="nearest")
 
 
@@ -245,7 +240,7 @@ _AROUND_LATERAL_M, _AROUND_DEPTH_SHARE, _AROUND_TURN_RAD = 0.015, 0.04, 0.25
 
 
 def super_fibonacci(count: int) -> Float[np.ndarray, "count 4"]:
-    """Unit quaternions spread evenly over all rotations (super-Fibonacci spirals; Alexa, CVPR 2022)."""
+    """Return unit quaternions spread evenly over all rotations (super-Fibonacci spirals; Alexa, CVPR 2022)."""
     s = np.arange(count) + 0.5
     t = s / count
     alpha, beta = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / _PSI
@@ -254,7 +249,7 @@ def super_fibonacci(count: int) -> Float[np.ndarray, "count 4"]:
 
 
 def poses_from_mask(loss: PoseLoss, quaternions: Float[np.ndarray, "K 4"]) -> Pose:
-    """For each rotation the position at which the drawn outline has the centroid and the area of the mask.
+    """Find for each rotation the position at which the drawn outline has the centroid and the area of the mask.
 
     The photograph with the largest mask decides.
 
@@ -282,11 +277,11 @@ def poses_from_mask(loss: PoseLoss, quaternions: Float[np.ndarray, "K 4"]) -> Po
 
 
 def poses_around(pose: Pose, window: ObjectWindow, count: int, rng: np.random.Generator) -> Pose:
-    """The given pose and random ones around it: about 1.5 cm sideways, 4 % nearer or farther, 15 degrees turned.
+    """Draw poses around a given one, itself first: about 1.5 cm sideways, 4 % nearer or farther, 15 degrees turned.
 
     Args:
         pose: of one object in the world.
-        window: of a photograph: it tells what is sideways.
+        window: of the photograph whose camera says what is sideways.
         count: of poses.
         rng: of the draws.
     """
@@ -298,7 +293,7 @@ def poses_around(pose: Pose, window: ObjectWindow, count: int, rng: np.random.Ge
 
 
 def moved(poses: Pose, window: ObjectWindow, steps: Float[np.ndarray, "B 6"]) -> Pose:
-    """Poses shifted along a camera's axes [m] and turned about their origins by rotation vectors in its frame [rad]."""
+    """Shift poses along a camera's axes [m] and turn them about their origins by rotation vectors in it [rad]."""
     camera = window.T_camera_world.inverse()
     turns = quaternion_exp(rotate(camera.quaternion, steps[:, 3:]))
     quaternions = quaternion_multiply(turns, np.broadcast_to(poses.quaternion, (len(steps), 4)))
@@ -306,7 +301,7 @@ def moved(poses: Pose, window: ObjectWindow, steps: Float[np.ndarray, "B 6"]) ->
 
 
 def distinct(poses: Pose, losses: Float[np.ndarray, "K"], count: int, least_deg: float) -> list[int]:
-    """Numbers of the best poses whose rotations differ from those of better ones by `least_deg` or more."""
+    """Return the numbers of the best poses whose rotations differ from those of better ones by `least_deg` or more."""
     kept: list[int] = []
     for k in np.argsort(losses):
         if not kept or rotation_angle(poses.quaternion[kept], poses.quaternion[k]).min() > np.deg2rad(least_deg):
@@ -319,7 +314,7 @@ def distinct(poses: Pose, losses: Float[np.ndarray, "K"], count: int, least_deg:
 def cma_search(
     loss: PoseLoss, starts: Pose, *, generations: int, population: int, spread: float, rng: np.random.Generator
 ) -> tuple[Pose, Float[np.ndarray, "K"]]:
-    """One CMA-ES from each start; a generation of all is drawn as one batch.
+    """Run one CMA-ES from each start; a generation of all is drawn as one batch.
 
     Args:
         loss: what is minimised.
@@ -359,7 +354,7 @@ def cma_search(
 
 _AGREE_DEG = 12.0
 _AGREE_M = 0.02
-_FEWEST_OBJECTS = 2  # objects; one alone does not tell which of its sides is down
+_FEWEST_OBJECTS = 2  # one alone does not show which of its sides is down
 _DOWNWARD = np.array([0.0, 1.0, 0.5])  # in a camera's frame: it looks ahead and down
 
 
@@ -379,7 +374,7 @@ class TableGuess:
 
 
 def table_from_objects(priors: Sequence[TablePrior], poses: Sequence[Pose]) -> TableGuess | None:
-    """The plane that most objects stand on; None if fewer than two agree.
+    """Find the plane that most objects stand on; None if fewer than two agree.
 
     The vertical is the direction that a stable orientation of most objects agrees with within 12 degrees; the plane is
     at the median of their lowest points, of which those within 2 cm count.
@@ -411,17 +406,16 @@ def table_from_objects(priors: Sequence[TablePrior], poses: Sequence[Pose]) -> T
     level = float(np.mean([reach[number] for number in supported]))
     angles = [np.arccos(np.clip(d @ down, -1, 1)) for number, d in best[1] if number in supported]
     spread = float(np.rad2deg(np.sqrt(np.mean(np.square(angles)))))
-    return TableGuess(_frame(poses, supported, down, level), spread, supported)
-
-
-def _frame(poses: Sequence[Pose], supported: tuple[int, ...], down: np.ndarray, level: float) -> Pose:
-    """`T_world_camera` with z up, opposite to `down`, and z = 0 at `level` along it."""
     middle = np.mean([poses[number].position for number in supported], axis=0)
-    origin = middle + (level - middle @ down) * down
     right, _ = orthogonal_basis(-down)
+    T_world_camera = _frame(right, np.cross(-down, right), -down, middle + (level - middle @ down) * down)
+    return TableGuess(T_world_camera, spread, supported)
+
+
+def _frame(right: np.ndarray, ahead: np.ndarray, up: np.ndarray, origin: np.ndarray) -> Pose:
+    """Return `T_world_camera` of a world whose axes and origin [m] are given in the camera's frame."""
     matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([right, np.cross(-down, right), -down], axis=1)
-    matrix[:3, 3] = origin
+    matrix[:3, :3], matrix[:3, 3] = np.stack([right, ahead, up], axis=1), origin
     return Pose.from_matrix(matrix).inverse()
 
 
@@ -435,7 +429,7 @@ _FEWEST_INLIERS = 50
 
 
 def table_from_points(points_camera: Float[np.ndarray, "P 3"], rng: np.random.Generator) -> Pose:
-    """`T_world_camera` such that most points lie at z = 0, by RANSAC and a least-squares plane through its inliers.
+    """Return `T_world_camera` such that most points lie at z = 0: RANSAC, then a least-squares plane of its inliers.
 
     The world's origin is the inliers' mean; z points from the plane to the camera's side.
 
@@ -465,12 +459,10 @@ def table_from_points(points_camera: Float[np.ndarray, "P 3"], rng: np.random.Ge
     right, ahead = orthogonal_basis(normal)
     if np.cross(right, ahead) @ normal < 0:
         ahead = -ahead
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = np.stack([right, ahead, normal], axis=1), centre
-    return Pose.from_matrix(matrix).inverse()
+    return _frame(right, ahead, normal, centre)
 
 
-# What the estimation of a photographed scene yields, and its result.
+# Steps and result of the estimation of a photographed scene.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -494,14 +486,15 @@ class PhotoPose:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PhotoObject:
-    """What was found of one object.
+    """One object that was looked for.
 
     Attributes:
         name: of the object.
         best: the most likely pose.
         rivals: other orientations, the best first; a person may choose one.
         doubt: why it should not be trusted, in a sentence; "" where it may be.
-        seconds: that the search over rotations and the refinement took.
+        coarse_s: duration of the search over rotations [s].
+        refine_s: of the refinement [s].
     """
 
     name: str
@@ -511,11 +504,6 @@ class PhotoObject:
     coarse_s: float
     refine_s: float
 
-    @property
-    def ratio(self) -> float:
-        """Loss of the best rival over that of the pose; infinite without rivals."""
-        return self.rivals[0].loss / max(self.best.loss, 1e-9) if self.rivals else float("inf")
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PhotoStep:
@@ -524,7 +512,7 @@ class PhotoStep:
     Attributes:
         progress: how far the work is.
         found: objects so far, in the photographs' world.
-        table: what objects were found to lie on, where no photograph tells; with the last step only.
+        table: on which objects were found to lie, where no photograph shows a board; with the last step only.
     """
 
     progress: Progress
@@ -542,12 +530,12 @@ _MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
 
 
 def fits_outline(best: PhotoPose) -> bool:
-    """Whether the drawn outline is that of the mask."""
+    """Return whether the drawn outline is that of the mask."""
     return best.iou >= _LEAST_IOU
 
 
 def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: PoseLoss) -> str:
-    """The first reason that applies; "" if none does.
+    """Return the first reason for doubt that applies; "" if none does.
 
     Args:
         name: of the object.
@@ -578,7 +566,7 @@ _SIDE = 240  # of a mask whose object is drawn [px]
 def without_others(
     photos: Sequence[Photograph], name: str, found: Sequence[PhotoObject], surfels: Mapping[str, Surfels]
 ) -> list[Photograph]:
-    """Photographs in which the others' masks hold whatever may hide an object, and its own mask none of it.
+    """Return photographs in which the others' masks hold whatever may hide an object, and its own mask none of it.
 
     An outline drawn in the pose that was found is added to each other's mask. What such an outline and a mask that it
     fits both claim is taken from the object's own.
@@ -589,45 +577,27 @@ def without_others(
         found: all objects.
         surfels: of each object, by name.
     """
-    return [_without_others(photo, name, found, surfels) if name in photo.masks else photo for photo in photos]
-
-
-def _without_others(
-    photo: Photograph, name: str, found: Sequence[PhotoObject], surfels: Mapping[str, Surfels]
-) -> Photograph:
-    masks, own = dict(photo.masks), photo.masks[name].copy()
-    for other in found:
-        if other.name == name or other.name not in masks:
-            continue
-        drawn = _outline(photo, other, surfels[other.name])
-        if fits_outline(other.best):
-            own &= ~(drawn & masks[other.name])
-        masks[other.name] = masks[other.name] | drawn
-    return replace(photo, masks={**masks, name: own})
-
-
-def _outline(photo: Photograph, found: PhotoObject, surfels: Surfels) -> Bool[np.ndarray, "h w"]:
-    """The pixels of a photograph that an object covers, as far as its window reaches."""
-    window = object_windows([photo], found.name, _SIDE)[0]
-    index, _ = draw(surfels, window, found.best.pose[None])
-    return _placed(index[0] >= 0, window.frame, photo.masks[found.name].shape)
-
-
-def _placed(drawn: Bool[np.ndarray, "a b"], frame: WindowFrame, shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
-    """A window's pixels in the whole photograph."""
-    high, wide = shape
-    whole = cv2.resize(drawn.astype(np.float32), (frame.right - frame.left, frame.bottom - frame.top)) > 0.5
-    top, left, bottom, right = max(frame.top, 0), max(frame.left, 0), min(frame.bottom, high), min(frame.right, wide)
-    placed = np.zeros((high, wide), bool)
-    placed[top:bottom, left:right] = whole[top - frame.top : bottom - frame.top, left - frame.left : right - frame.left]
-    return placed
+    seen = []
+    for photo in photos:
+        masks = dict(photo.masks)
+        for other in found:
+            if name not in masks or other.name == name or other.name not in masks:
+                continue
+            window = object_windows([photo], other.name, _SIDE)[0]
+            index, _ = draw(surfels[other.name], window, other.best.pose[None])
+            drawn = window.frame.placed(index[0] >= 0, masks[name].shape)  # as far as its window reaches
+            if fits_outline(other.best):
+                masks[name] = masks[name] & ~(drawn & masks[other.name])
+            masks[other.name] = masks[other.name] | drawn
+        seen.append(replace(photo, masks=masks) if name in masks else photo)
+    return seen
 
 
 # Poses of known objects in photographs: from masks and fields alone, or from poses that another program gives.
 #
 # For each object: candidates (all rotations, put where the mask is, or poses around a given one) are ranked in a
 # small window by outline, shading and texture (`PoseLoss`); CMA-ES refines the best that differ, in the small
-# window and then in a finer one; Gauss-Newton aligns the best of these (`pose_alignment`). Cameras and masks are
+# window and then in a finer one; Gauss-Newton aligns the best of these (`align`). Cameras and masks are
 # given, the light need not be known.
 
 
@@ -678,7 +648,7 @@ class PhotoModels:
             raise UnknownName("field", name, sorted(self._fields))
 
     def surfels(self, name: str, across: int) -> Surfels:
-        """Of an object, about `across` of them along its diameter."""
+        """Return surfels of an object, about `across` of them along its diameter."""
         key = name, across
         if key not in self._surfels:
             self.check(name)
@@ -688,7 +658,7 @@ class PhotoModels:
         return self._surfels[key]
 
     def table_prior(self, name: str) -> TablePrior:
-        """What a table tells of an object's pose."""
+        """Return the prior of a table on an object's pose."""
         if name not in self._priors:
             self.check(name)
             self._priors[name] = TablePrior(resting_orientations(self._fields[name]))
@@ -752,7 +722,7 @@ def _found_behind(
     rng: np.random.Generator,
     config: PhotoConfig,
 ) -> tuple[PhotoObject, Sequence[Photograph]]:
-    """An object in masks without the others, and these masks; as before if its outline fits them no better."""
+    """Look for an object in masks without the others; return these too, or all as before if it fits no better."""
     before = found[number]
     surfels = {other.name: models.surfels(other.name, FINE_ACROSS) for other in found}
     without = without_others(photos, before.name, found, surfels)
@@ -766,7 +736,7 @@ def _found_behind(
 def _on_table(
     models: PhotoModels, photo: Photograph, found: PhotoObject, table: TableGuess, config: PhotoConfig
 ) -> PhotoObject:
-    """An object aligned once more, now that it is known to lie on a table; its pose stays in the camera's frame."""
+    """Align an object once more, now that it is known to lie on a table; its pose stays in the camera's frame."""
     start = time.perf_counter()
     seen = replace(photo, T_world_camera=table.T_world_camera, on_table=True)
     sharp, plain = (
@@ -785,7 +755,7 @@ def _on_table(
 
 
 def _photo_poses(poses: Pose, loss: PoseLoss) -> list[PhotoPose]:
-    """Poses with what the loss says of each."""
+    """Return poses with the parts of each one's loss."""
     terms = loss.terms(poses)
     parts = zip(terms.losses, terms.iou, terms.residual, terms.correlation, strict=True)
     return [PhotoPose(poses[k], *(float(v) for v in values)) for k, values in enumerate(parts)]

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import struct
+import threading
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,12 +17,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
-from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageCms, ImageFile
+from PIL.TiffImagePlugin import TiffImageFile
 from pillow_heif import register_heif_opener
 
 from osfcore.errors import CorruptFile, OsfError, check_ranges, shown
 from osfcore.estimation.camera_response import Encoding, linear_from_encoded
 from osfcore.geometry.poses import Pose
+from osfcore.photo.board import camera_matrix
 from osfcore.photo.photograph import Photograph
 
 FORMATS = ("PNG", "JPEG", "WEBP", "HEIF", "AVIF", "TIFF", "GIF", "BMP")
@@ -28,21 +32,14 @@ MAX_PIXELS = 200_000_000
 MAX_BYTES = 500_000_000
 MIN_SIDE = 32
 KEPT_SIDE = 2048  # larger photos are scaled down to this
-SATURATED, BLACK = 251 / 255, 1 / 255  # encoded values from which and up to which a sensor tells nothing
+SATURATED, BLACK = 251 / 255, 1 / 255  # encoded values from which and up to which radiance is unknown
 ASSUMED_DIAGONAL_DEG = 75.0  # field of view of a phone's main camera, from corner to corner
 _FILM_DIAGONAL_MM = 43.27  # of the 36 x 24 mm to which equivalent focal lengths refer
 _FOCAL_RANGE = 0.2, 50.0  # per longest side: what lies outside is a mistake in the metadata
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of EXIF's FocalPlaneResolutionUnit
 _WIDE_MODES = ("I;16", "I;16B", "I;16L", "I;16N")
-_UPRIGHT = {  # quarter turns counter-clockwise, then whether to mirror, by EXIF's orientation
-    2: (0, True),
-    3: (2, False),
-    4: (2, True),
-    5: (3, True),
-    6: (3, False),
-    7: (1, True),
-    8: (1, False),
-}
+# Quarter turns counter-clockwise, then whether to mirror, by EXIF's orientation.
+_UPRIGHT = {2: (0, True), 3: (2, False), 4: (2, True), 5: (3, True), 6: (3, False), 7: (1, True), 8: (1, False)}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,7 +50,7 @@ class RawPhotograph:
         encoded: values as the file holds them, in the primaries of sRGB; perhaps scaled down.
         encoding: of these values.
         sent_size: width and height of the upright photo as it was sent [px].
-        focal_px: focal length in pixels of `encoded`, from EXIF; None if that does not tell.
+        focal_px: focal length in pixels of `encoded`, from EXIF; None if that lacks it.
         notes: sentences for the user about what was done to the photo.
     """
 
@@ -66,11 +63,13 @@ class RawPhotograph:
     @property
     def eight_bit(self) -> UInt8[np.ndarray, "h w 3"]:
         """The encoded values in 8 bit, to look at."""
-        return _eight_bit(self.encoded)
+        if self.encoded.dtype == np.uint8:
+            return self.encoded
+        return ((self.encoded.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
 def read_photograph(data: bytes | Path, *, encoding: Encoding = "srgb") -> RawPhotograph:
-    """A photo in any usual format, upright, no side longer than 2048 px.
+    """Read a photo in any usual format, upright, no side longer than 2048 px.
 
     Grey, palettes, CMYK and 16 bits a channel (which PNG and grey TIFF keep) are understood; what is transparent
     becomes white; 8-bit colours of another profile are converted to sRGB; of an animation the first image counts.
@@ -82,37 +81,98 @@ def read_photograph(data: bytes | Path, *, encoding: Encoding = "srgb") -> RawPh
     Raises:
         CorruptFile: if it is no such image, is broken, or has too many or too few pixels.
     """
-    name, content = ("The photo", data) if isinstance(data, bytes) else (shown(data), _content(data))
+    name, content = ("The photo", data) if isinstance(data, bytes) else (shown(data), content_of(data, data, MAX_BYTES))
+    allowed = f"{MAX_PIXELS // 1_000_000} million are allowed"
     try:
-        with _no_warnings(), Image.open(io.BytesIO(content), formats=FORMATS) as image:
-            _check_size(name, *image.size)
+        with _without_warnings(), _opened(name, content) as image:
+            width, height = image.size
+            if width * height > 2 * MAX_PIXELS:
+                raise CorruptFile(name, f"it has far too many pixels; {allowed}")
+            if width * height > MAX_PIXELS:
+                raise CorruptFile(name, f"it has {width} x {height} pixels; {allowed}")
+            if min(width, height) < MIN_SIDE:
+                raise CorruptFile(name, f"it has {width} x {height} pixels; at least {MIN_SIDE} a side are needed")
             return _read(image, content, encoding)
     except OsfError:  # a ValueError itself
         raise
     except MemoryError:
         raise CorruptFile(name, "it needs too much memory to be decoded; take a smaller one") from None
-    except UnidentifiedImageError:
-        kinds = "a JPEG, PNG, WebP, HEIC, AVIF, TIFF, GIF or BMP file"
-        raise CorruptFile(name, f"it is no picture that can be read here; send {kinds}") from None
-    except Image.DecompressionBombError:
-        raise CorruptFile(name, f"it has far too many pixels; {_millions(MAX_PIXELS)} are allowed") from None
+    except Image.DecompressionBombError:  # of the decoder of WebP, which has its own limit
+        raise CorruptFile(name, f"it has far too many pixels; {allowed}") from None
     except Exception:  # decoders raise whatever their own code stumbles over
         raise CorruptFile(name, "it is damaged or incomplete, and cannot be decoded; send it anew") from None
 
 
+def content_of(path: Path, name: Path | str, most: int) -> bytes:
+    """Read a file of at most so many bytes.
+
+    Raises:
+        CorruptFile: under this name, if it cannot be read or is larger.
+    """
+    try:
+        if path.stat().st_size > most:
+            raise CorruptFile(name, f"it is larger than {most // 1_000_000} MB")
+        return path.read_bytes()
+    except OSError as error:
+        raise CorruptFile(name, error.strerror or str(error)) from error
+
+
+class _LargeTiff(TiffImageFile):
+    """A TIFF of any size: its pixels have been counted before they are decoded."""
+
+    def load_prepare(self) -> None:
+        if self._im is None:
+            self.im = Image.core.new(self.mode, self._tile_size)
+        ImageFile.ImageFile.load_prepare(self)
+
+
+def _opened(name: str, content: bytes) -> Image.Image:
+    """Read a picture's header, as `Image.open` does, but without its limit on pixels, which all threads share."""
+    register_heif_opener()
+    Image.init()
+    for kind in FORMATS:
+        opener, accepts = Image.OPEN[kind]
+        with contextlib.suppress(SyntaxError, IndexError, TypeError, struct.error):  # of another format
+            accepted = accepts is None or accepts(content[:16])
+            if accepted and not isinstance(accepted, str):  # which says why this Pillow cannot
+                return (_LargeTiff if opener is TiffImageFile else opener)(io.BytesIO(content), "")
+    kinds = "a JPEG, PNG, WebP, HEIC, AVIF, TIFF, GIF or BMP file"
+    raise CorruptFile(name, f"it is no picture that can be read here; send {kinds}")
+
+
+_quiet_lock, _quiet_threads, _filters = threading.Lock(), 0, contextlib.ExitStack()
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Ignore what Pillow thinks of odd metadata; filters belong to all threads, so the last one restores them."""
+    global _quiet_threads
+    with _quiet_lock:
+        if _quiet_threads == 0:
+            _filters.enter_context(warnings.catch_warnings(action="ignore"))
+        _quiet_threads += 1
+    try:
+        yield
+    finally:
+        with _quiet_lock:
+            _quiet_threads -= 1
+            if _quiet_threads == 0:
+                _filters.close()
+
+
 def intrinsics_from_focal(width: int, height: int, focal_px: float) -> Float[np.ndarray, "3 3"]:
-    """K of a camera with square pixels that looks through the middle of its image; pixel centres at +0.5.
+    """Return K of a camera with square pixels that looks through the middle of its image; pixel centres at +0.5.
 
     Raises:
         InvalidInput: if the focal length is less than a fifth of the image's longest side, or more than 50 times that.
     """
     low, high = (factor * max(width, height) for factor in _FOCAL_RANGE)
     check_ranges(("focal length [px]", focal_px, low, high))
-    return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1.0]])
+    return camera_matrix(focal_px, width / 2, height / 2)
 
 
 def guessed_intrinsics(raw: RawPhotograph) -> tuple[Float[np.ndarray, "3 3"], str]:
-    """K as EXIF tells it, else that of a phone's main camera, and a sentence that says which."""
+    """Return K as EXIF has it, else that of a phone's main camera, and a sentence that says which."""
     height, width = raw.encoded.shape[:2]
     if raw.focal_px is not None:
         note = f"The focal length, {raw.focal_px:.0f} pixels, is what the camera wrote into the photo."
@@ -131,7 +191,7 @@ def to_photograph(
     T_world_camera: Pose | None = None,
     masks: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
 ) -> Photograph:
-    """Linear radiance of a decoded photo, and which of its pixels can be trusted.
+    """Compute the linear radiance of a decoded photo, and which of its pixels can be trusted.
 
     Args:
         raw: as it was read.
@@ -148,40 +208,6 @@ def to_photograph(
     well_exposed = (brightest > BLACK * most) & (brightest < SATURATED * most)
     pose = Pose.identity() if T_world_camera is None else T_world_camera
     return Photograph(radiance[raw.encoded], well_exposed, intrinsics, pose, T_world_camera is not None, masks or {})
-
-
-def _content(path: Path) -> bytes:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise CorruptFile(path, f"it is larger than {MAX_BYTES // 1_000_000} MB")
-        return path.read_bytes()
-    except OSError as error:
-        raise CorruptFile(path, error.strerror or str(error)) from error
-
-
-@contextlib.contextmanager
-def _no_warnings() -> Iterator[None]:
-    """Pillow opens all that is allowed here, and keeps to itself what it thinks of odd metadata and of sizes."""
-    register_heif_opener()
-    before, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MAX_PIXELS  # an error comes at twice that
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = before
-
-
-def _check_size(name: str, width: int, height: int) -> None:
-    size = f"it has {width} x {height} pixels"
-    if width * height > MAX_PIXELS:
-        raise CorruptFile(name, f"{size}; {_millions(MAX_PIXELS)} are allowed")
-    if min(width, height) < MIN_SIDE:
-        raise CorruptFile(name, f"{size}; at least {MIN_SIDE} a side are needed")
-
-
-def _millions(pixels: int) -> str:
-    return f"{pixels // 1_000_000} million"
 
 
 def _read(image: Image.Image, content: bytes, encoding: Encoding) -> RawPhotograph:
@@ -221,7 +247,7 @@ def _eight_bit_rgb(image: Image.Image, encoding: Encoding) -> tuple[UInt8[np.nda
 
 
 def _in_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, str]:
-    """The colours that a profile stands for: phones write a wider gamut than sRGB."""
+    """Convert the colours that a profile stands for: phones write a wider gamut than sRGB."""
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         name = shown(ImageCms.getProfileDescription(source).strip())
@@ -235,13 +261,14 @@ def _in_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, str]:
 
 
 def _sixteen_bit(image: Image.Image, content: bytes) -> UInt16[np.ndarray, "h w 3"]:
-    """All sixteen bits, of which Pillow keeps half unless the image is grey; transparent parts become white."""
+    """Decode all sixteen bits, of which Pillow keeps half unless the image is grey; what is transparent is white."""
     image.load()  # finds out damage, which OpenCV passes over
     if image.mode in _WIDE_MODES:
         values = np.asarray(image).astype(np.uint16)
     else:
         decoded = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        assert decoded is not None
+        if decoded is None:
+            raise OSError("OpenCV cannot decode what Pillow can")
         values = decoded
     scale = KEPT_SIDE / max(values.shape[:2])
     if scale < 1:
@@ -256,12 +283,8 @@ def _sixteen_bit(image: Image.Image, content: bytes) -> UInt16[np.ndarray, "h w 
     return rgb
 
 
-def _eight_bit(encoded: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
-    return encoded if encoded.dtype == np.uint8 else ((encoded.astype(np.uint32) + 128) // 257).astype(np.uint8)
-
-
 def _orientation(image: Image.Image) -> int:
-    """What EXIF says; 1 if its metadata cannot be understood (ImageOps gives up)."""
+    """Return EXIF's orientation; 1 if its metadata cannot be understood (ImageOps gives up)."""
     try:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
         return orientation if orientation in _UPRIGHT else 1
@@ -270,7 +293,7 @@ def _orientation(image: Image.Image) -> int:
 
 
 def _focal_per_diagonal(image: Image.Image) -> float | None:
-    """Focal length for each pixel of the diagonal, from EXIF; None if that does not tell, or nothing sane."""
+    """Return the focal length for each pixel of the diagonal, from EXIF; None if that lacks it, or is not sane."""
     width, height = image.size
     diagonal = float(np.hypot(width, height))
     try:

@@ -12,6 +12,10 @@ from jaxtyping import Bool, Float, UInt8
 from osfcore.errors import InvalidInput
 
 Box = tuple[float, float, float, float]
+Picture = UInt8[np.ndarray, "h w 3"]
+Labels = UInt8[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
+Points = Float[np.ndarray, "_ 2"]
 MIN_BOX_SIDE = 8
 _WORKING_SIDE = 200  # of the box at most [px]: fine enough for an outline, and fast
 _MARGIN = 0.2  # of the box's sides: what lies so near around it is the sample of the background
@@ -24,14 +28,14 @@ _WHAT = "box of the object [px]"
 
 
 def propose_mask(
-    image: UInt8[np.ndarray, "h w 3"],
+    image: Picture,
     box: Box,
-    foreground: Float[np.ndarray, "k 2"],
-    background: Float[np.ndarray, "j 2"] | None = None,
-    add: Bool[np.ndarray, "h w"] | None = None,
-    remove: Bool[np.ndarray, "h w"] | None = None,
-) -> Bool[np.ndarray, "h w"]:
-    """The mask of an object that a person points at.
+    foreground: Points,
+    background: Points | None = None,
+    add: Mask | None = None,
+    remove: Mask | None = None,
+) -> Mask:
+    """Find the mask of an object that a person points at.
 
     GrabCut runs twice, beginning from the whole box and from an ellipse in it; the result whose extent fits the box
     better is taken. Of each those parts remain that hold a click or a stroke (without such, the largest), and holes
@@ -60,14 +64,12 @@ def propose_mask(
     found = [_tidied(_cut(picture, start), marks) for start in _starts(marks, corners)]
     mask = window.enlarged(min(found, key=lambda mask: _misfit(mask, corners)), shape)
     if not mask.any():
-        raise InvalidInput(_WHAT, _told(box), "around something that differs from what surrounds it")
+        raise InvalidInput(_WHAT, _corners_text(box), "around something that differs from what surrounds it")
     return mask
 
 
-def propose_masks(
-    image: UInt8[np.ndarray, "h w 3"], boxes: Mapping[str, Box], clicks: Mapping[str, Float[np.ndarray, "k 2"]]
-) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """The masks of several objects: what a click says is one of them is background for the others.
+def propose_masks(image: Picture, boxes: Mapping[str, Box], clicks: Mapping[str, Points]) -> dict[str, Mask]:
+    """Find the masks of several objects: clicks on one are background for the others.
 
     Args:
         image: encoded RGB, as people see it.
@@ -77,12 +79,11 @@ def propose_masks(
     Raises:
         InvalidInput: as `propose_mask`.
     """
-    return {name: propose_mask(image, box, clicks[name], others_of(clicks, name)) for name, box in boxes.items()}
-
-
-def others_of(clicks: Mapping[str, Float[np.ndarray, "k 2"]], name: str) -> Float[np.ndarray, "j 2"]:
-    """Clicks on other objects than one."""
-    return np.concatenate([np.zeros((0, 2)), *(points for other, points in clicks.items() if other != name)])
+    masks = {}
+    for name, box in boxes.items():
+        others = np.concatenate([np.zeros((0, 2)), *(points for other, points in clicks.items() if other != name)])
+        masks[name] = propose_mask(image, box, clicks[name], others)
+    return masks
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,17 +111,17 @@ class _Window:
         return max(round(width), 1), max(round(height), 1)
 
     def reduced(self, picture: np.ndarray) -> np.ndarray:
-        """What is cut out, averaged."""
+        """Cut a picture out, averaged."""
         part = picture[self.top : self.bottom, self.left : self.right]
         return cv2.resize(part, self.size, interpolation=cv2.INTER_AREA)
 
-    def points(self, points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
-        """Positions in the reduced picture."""
+    def points(self, points: Points) -> Points:
+        """Map positions into the reduced picture."""
         per_px = np.array(self.size) / (self.right - self.left, self.bottom - self.top)
         return (points - (self.left, self.top)) * per_px
 
-    def enlarged(self, mask: Bool[np.ndarray, "a b"], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-        """A mask at its place in the whole picture, its outline smooth."""
+    def enlarged(self, mask: Bool[np.ndarray, "a b"], shape: tuple[int, int]) -> Mask:
+        """Put a mask at its place in the whole picture, its outline smooth."""
         soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _OUTLINE_SIGMA, borderType=cv2.BORDER_REPLICATE)
         whole = np.zeros(shape, bool)
         size = self.right - self.left, self.bottom - self.top
@@ -134,18 +135,20 @@ def _checked_box(box: Box, height: int, width: int) -> Box:
     sides = inside[2] - inside[0], inside[3] - inside[1]
     if not np.all(np.isfinite(box)) or not min(sides) > 0:
         raise InvalidInput(
-            _WHAT, _told(box), f"within the picture's {width} x {height}, given as left, top, right, bottom"
+            _WHAT, _corners_text(box), f"within the picture's {width} x {height}, given as left, top, right, bottom"
         )
     if min(sides) < MIN_BOX_SIDE:
-        raise InvalidInput(_WHAT, _told(box), f"at least {MIN_BOX_SIDE} a side within the picture")
+        raise InvalidInput(_WHAT, _corners_text(box), f"at least {MIN_BOX_SIDE} a side within the picture")
     return inside
 
 
-def _checked_clicks(points: np.ndarray, box: Box) -> Float[np.ndarray, "k 2"]:
+def _checked_clicks(points: np.ndarray, box: Box) -> Points:
     low, high = np.reshape(box, (2, 2))
     inside = np.all((points >= low) & (points < high), axis=1)  # false for NaN
     if not inside.all():
-        raise InvalidInput("click on the object [px]", points[~inside][0].tolist(), f"inside its box, {_told(box)}")
+        raise InvalidInput(
+            "click on the object [px]", points[~inside][0].tolist(), f"inside its box, {_corners_text(box)}"
+        )
     return points
 
 
@@ -155,14 +158,14 @@ def _checked_stroke(stroke: np.ndarray | None, shape: tuple[int, int]) -> np.nda
     return np.zeros(shape, np.float32) if stroke is None else stroke.astype(np.float32)
 
 
-def _told(box: Box) -> str:
+def _corners_text(box: Box) -> str:
     return ", ".join(f"{side:.0f}" for side in box)
 
 
 def _marks(
     window: _Window, corners: np.ndarray, clicks: tuple[np.ndarray, np.ndarray], strokes: tuple[np.ndarray, np.ndarray]
-) -> UInt8[np.ndarray, "a b"]:
-    """What is known of each pixel: GC_FGD or GC_BGD; GC_PR_FGD where it is to be found out."""
+) -> Labels:
+    """Label each pixel: GC_FGD or GC_BGD where marks say so, GC_PR_FGD where it is to be found out."""
     width, height = window.size
     marks = np.full((height, width), cv2.GC_BGD, np.uint8)
     (x0, y0), (x1, y1) = corners
@@ -180,8 +183,8 @@ def _marks(
     return marks
 
 
-def _starts(marks: UInt8[np.ndarray, "a b"], corners: np.ndarray) -> list[UInt8[np.ndarray, "a b"]]:
-    """Labels of GrabCut: all that is unknown is probably object; only an ellipse in the middle is."""
+def _starts(marks: Labels, corners: np.ndarray) -> list[Labels]:
+    """Return two starts of GrabCut: all that is unknown is probably object, or only an ellipse in the middle."""
     (x0, y0), (x1, y1) = corners
     core = np.zeros_like(marks)
     middle, axes = ((x0 + x1) / 2, (y0 + y1) / 2), (_CORE * (x1 - x0), _CORE * (y1 - y0))
@@ -190,7 +193,7 @@ def _starts(marks: UInt8[np.ndarray, "a b"], corners: np.ndarray) -> list[UInt8[
     return [marks.copy(), outer.astype(np.uint8)]
 
 
-def _cut(picture: UInt8[np.ndarray, "a b 3"], labels: UInt8[np.ndarray, "a b"]) -> Bool[np.ndarray, "a b"]:
+def _cut(picture: Picture, labels: Labels) -> Mask:
     is_object = labels % 2 == 1  # GC_FGD and GC_PR_FGD are odd
     if is_object.all() or not is_object.any():  # GrabCut needs samples of both
         return np.zeros(labels.shape, bool)
@@ -201,8 +204,8 @@ def _cut(picture: UInt8[np.ndarray, "a b 3"], labels: UInt8[np.ndarray, "a b"]) 
     return labels % 2 == 1
 
 
-def _tidied(found: Bool[np.ndarray, "a b"], marks: UInt8[np.ndarray, "a b"]) -> Bool[np.ndarray, "a b"]:
-    """The parts that hold a mark, else the largest; holes that hold no mark of the background are filled."""
+def _tidied(found: Mask, marks: Labels) -> Mask:
+    """Keep the parts that hold a mark, else the largest; fill holes that hold no mark of the background."""
     if not found.any():
         return found
     _, parts, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=4)
@@ -215,8 +218,8 @@ def _tidied(found: Bool[np.ndarray, "a b"], marks: UInt8[np.ndarray, "a b"]) -> 
     return kept | holes[1:-1, 1:-1]
 
 
-def _misfit(mask: Bool[np.ndarray, "a b"], corners: np.ndarray) -> float:
-    """How far a mask's extent is from the box, summed over its four sides, each per side of the box."""
+def _misfit(mask: Mask, corners: np.ndarray) -> float:
+    """Return how far a mask's extent is from the box, summed over its four sides, each per side of the box."""
     if not mask.any():
         return np.inf
     xs, ys = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))

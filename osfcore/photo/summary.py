@@ -1,4 +1,4 @@
-"""What was found in photographs, for files and people: poses, lamp, camera, and sentences."""
+"""The result of an estimation for files and people: poses, lamp, camera, and sentences."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
 from osfcore.io.scene_file import CameraJson
-from osfcore.photo.board import PAGE_M, UNTOLD, Board, BoardView, locate_board
+from osfcore.photo.board import PAGE_M, UNKNOWN_FOCAL, Board, BoardView, locate_board
 from osfcore.photo.calibration import KnownCamera
 from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, FoundScene
 from osfcore.photo.lamp import photo_lamp, photo_light
@@ -25,10 +25,10 @@ from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, int
 
 
 def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels, notes: Sequence[str]) -> FoundScene:
-    """The result of an estimation.
+    """Summarise an estimation.
 
     Args:
-        photos: of one table; the light is that of the one with most masks.
+        photos: of one table.
         step: the last one.
         models: of the objects.
         notes: sentences for the user about the photo.
@@ -50,11 +50,11 @@ def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModel
 
 
 def _light(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels) -> tuple[FoundLight, list[str]]:
-    """The lamp in the frame of the table where there is one, and what is not known of it, in sentences."""
+    """Find the lamp in the frame of the table where there is one; also sentences on what is not known of it."""
     surfels, found = [models.surfels(each.name, FINE_ACROSS) for each in step.found], step.found
     if step.table is None and not photos[0].on_table:
         fit = photo_light(photos[0], found, surfels)
-        light = _told(fit.direction, fit.std, is_diffuse=fit.is_diffuse)
+        light = _found_light(fit.direction, fit.std, is_diffuse=fit.is_diffuse)
         return light, ["How far away the lamp is, cannot be told without a known table."]
     covered: tuple[float, float] | None = PAGE_M
     if step.table is not None:
@@ -62,7 +62,7 @@ def _light(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels) -
         photos = [replace(photos[0], T_world_camera=place, on_table=True)]
         found = [replace(each, best=replace(each.best, pose=place @ each.best.pose)) for each in found]
     fit = photo_lamp(photos, found, surfels, covered_m=covered)
-    light = _told(fit.direction, fit.std, is_diffuse=fit.is_diffuse)
+    light = _found_light(fit.direction, fit.std, is_diffuse=fit.is_diffuse)
     if fit.is_diffuse:
         return light, []
     if not fit.distance_known:
@@ -71,13 +71,13 @@ def _light(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels) -
     return light.model_copy(update=far), []
 
 
-def _told(direction: Float[np.ndarray, "3"], std: float, *, is_diffuse: bool) -> FoundLight:
+def _found_light(direction: Float[np.ndarray, "3"], std: float, *, is_diffuse: bool) -> FoundLight:
     facts = {"std_deg": float(np.rad2deg(std)), "distance_m": None, "distance_std_m": None}
     return FoundLight(direction=direction.tolist(), diffuse=is_diffuse, **facts)
 
 
 def _camera(number: int, T_table_world: Pose, photo: Photograph) -> CameraJson:
-    """The camera of a photograph, which may have more pixels than one of the simulation."""
+    """Return the camera of a photograph, which may have more pixels than one of the simulation."""
     T_table_camera = (T_table_world @ photo.T_world_camera).matrix().tolist()
     K, size = photo.intrinsics.tolist(), {"width": photo.width, "height": photo.height}
     return CameraJson(name=f"photo {number}", T_world_camera=T_table_camera, K=K, **size)
@@ -94,7 +94,7 @@ def _found(T_table_world: Pose, found: PhotoObject) -> FoundObject:
     return FoundObject(**best.model_dump(), name=found.name, doubt=found.doubt, rivals=rivals)
 
 
-# The camera of a decoded photograph: over a printed board if it shows one, else as far as its file tells.
+# The camera of a decoded photograph: over a printed board if it shows one, else from the file.
 
 
 FocalSource = Literal["board", "given", "file", "assumed"]
@@ -109,7 +109,7 @@ class Located:
         raw: free of distortion.
         intrinsics: K of `raw` [px].
         lens: that was found.
-        source: who tells the focal length.
+        source: of the focal length.
         T_world_camera: pose over the board; None if there is none.
         notes: sentences for the user about photo and camera.
         missing: why no board was found; "" where one was.
@@ -124,7 +124,7 @@ class Located:
     missing: str = ""
 
     def straightened(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-        """A mask of the photograph as it was read, in the one that is free of distortion."""
+        """Straighten a mask of the photograph as it was read."""
         return self.lens.straightened(mask.astype(np.float32)) > 0.5
 
 
@@ -170,7 +170,7 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
 
 
 def locate_calibrated(raw: RawPhotograph, camera: KnownCamera) -> Located:
-    """The photograph of a calibrated camera: it stands where the calibration says, else over the board in view, if any.
+    """Place the photograph of a calibrated camera: it stands where the calibration says, else over a board in view.
 
     Args:
         raw: the decoded photo.
@@ -195,12 +195,12 @@ def locate_calibrated(raw: RawPhotograph, camera: KnownCamera) -> Located:
 def _over_board(
     raw: RawPhotograph, given: Float[np.ndarray, "3 3"] | None, notes: list[str]
 ) -> tuple[BoardView, Lens, FocalSource]:
-    """The camera, its lens, and who tells the focal length; one that the board does not tell is guessed, and noted."""
+    """Find camera, lens and source of the focal length; one that the board leaves open is guessed, and noted."""
     source: FocalSource = "board" if given is None else "given"
     try:
         view, lens = locate_board_through_lens(raw.eight_bit, Board(), given)
     except InvalidInput as error:
-        if error.what != UNTOLD:
+        if error.what != UNKNOWN_FOCAL:
             raise
         guess, note = guessed_intrinsics(raw)
         view, lens = locate_board_through_lens(raw.eight_bit, Board(), guess)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 
@@ -16,11 +15,10 @@ from osfcore.photo.found_scene import FoundLight, FoundScene
 
 _LEAST_HORIZONTAL = 1e-3  # of a viewing direction: a camera that looks straight down has its image's top ahead
 _LOWEST = float(np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG + 0.5)))  # of a unit vector toward a lamp
-_FIRST: Mapping[str, int] = MappingProxyType({})
 
 
 class NoPhotographedTable(OsfError):
-    """A photograph that does not tell where the table is."""
+    """A photograph in which no table was found."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -46,8 +44,10 @@ class TableLayout:
     light: Light
 
 
-def layout_of(found: FoundScene, choices: Mapping[str, int] = _FIRST, T_table_photo: Pose | None = None) -> TableLayout:
-    """Where objects, camera and lamp of a photograph are on our table.
+def layout_of(
+    found: FoundScene, choices: Mapping[str, int] | None = None, T_table_photo: Pose | None = None
+) -> TableLayout:
+    """Move objects, camera and lamp of a photograph onto our table.
 
     Args:
         found: in the photograph.
@@ -61,7 +61,7 @@ def layout_of(found: FoundScene, choices: Mapping[str, int] = _FIRST, T_table_ph
     if found.table is None:
         raise NoPhotographedTable
     camera = Pose.from_matrix(np.array(found.camera.T_world_camera))
-    poses = {each.name: each.poses()[choices.get(each.name, 0)].pose() for each in found.objects}
+    poses = {each.name: each.poses()[(choices or {}).get(each.name, 0)].pose() for each in found.objects}
     T = place_on_table(camera, list(poses.values())) if T_table_photo is None else T_table_photo
     placed = {name: T @ pose for name, pose in poses.items()}
     for name, pose in placed.items():
@@ -72,7 +72,7 @@ def layout_of(found: FoundScene, choices: Mapping[str, int] = _FIRST, T_table_ph
 
 
 def _light(found: FoundLight | None, T_table_photo: Pose) -> Light:
-    """The lamp on our table, never below the least height; overhead where nothing speaks for one."""
+    """Return the lamp on our table, never below the least height; overhead where nothing speaks for one."""
     if found is None or found.diffuse:
         return Light(np.array([0.0, 0.0, 1.0]))
     x, y, z = rotate(T_table_photo.quaternion, np.array(found.direction))
@@ -82,7 +82,7 @@ def _light(found: FoundLight | None, T_table_photo: Pose) -> Light:
 
 
 def place_on_table(T_photo_camera: Pose, objects: Sequence[Pose]) -> Pose:
-    """`T_table_photo`, a turn about the vertical and a horizontal shift.
+    """Return `T_table_photo`, a turn about the vertical and a horizontal shift.
 
     The camera then looks along +y, as the goal camera does, and the bounding rectangle of the objects' centres has its
     middle above the table's. Photographs that share a frame (of a printed board) should share this pose, too.

@@ -1,32 +1,7 @@
-"""A photograph made of a field: posed, lit, exposed, white-balanced and stored as a camera would."""
-
-from dataclasses import dataclass
-
-import numpy as np
 import pytest
 
-from osfcore.estimation.camera_response import linear_from_encoded, srgb_of_linear
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import Camera
-from osfcore.geometry.poses import Pose, quaternion_exp
-from osfcore.io.image_file import to_uint8
-from osfcore.photo.photograph import Photograph
-from osfcore.render.renderer import SceneRenderer
-from osfcore.render.types import SceneBatch
-
-NAME = "009_gelatin_box"
-INTRINSICS = np.array([[600.0, 0, 150], [0, 600, 130], [0, 0, 1]])
-
-
-@dataclass(frozen=True, eq=False)
-class Taken:
-    """A photograph and the truth."""
-
-    photo: Photograph
-    encoded: np.ndarray
-    pose: Pose
-    light: np.ndarray
-    depth: np.ndarray
+from tests.support.photographs import NAME, take
 
 
 @pytest.fixture(scope="session")
@@ -35,21 +10,7 @@ def fields():
     return {name: library.load(name) for name in (NAME, "006_mustard_bottle")}
 
 
-def take(fields, name=NAME, turn=(2.2, 0.5, -0.3), light=(0.5, -0.7, -0.6), gain=(0.62, 0.7, 0.8)) -> Taken:
-    pose = Pose(np.array([0.01, -0.015, 0.62]), quaternion_exp(np.array(turn)))
-    light = np.array(light) / np.linalg.norm(light)
-    camera = Camera("photo", Pose.identity(), INTRINSICS, 300, 260)
-    batch = SceneBatch((name,), pose.position[None, None], pose.quaternion[None, None], light[None], None)
-    drawn = SceneRenderer(fields, None).render(batch, [camera], outputs={"rgb", "masks", "depth"})
-    mask = drawn.masks[0, 0, 0]
-    background = np.random.default_rng(0).uniform(0.1, 0.3, (260, 300, 3))
-    radiance = np.where(mask[..., None], drawn.rgb[0, 0], background) * np.array(gain)
-    encoded = to_uint8(srgb_of_linear(radiance))
-    image = linear_from_encoded(encoded / 255.0, "srgb").astype(np.float32)
-    photo = Photograph(image, np.all(encoded < 251, axis=-1), INTRINSICS, Pose.identity(), False, {name: mask})
-    return Taken(photo, encoded, pose, light, drawn.depth[0, 0])
-
-
 @pytest.fixture(scope="session")
 def taken(fields):
+    """A photograph of a box, and the truth."""
     return take(fields)

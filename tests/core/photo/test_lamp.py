@@ -1,19 +1,19 @@
-"""Lamp: lamp, near lamp."""
+"""The lamp from shading of surfaces and cast shadows, in scenes made by the model in closed form."""
 
 import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.estimation.objective import fibonacci_sphere
 from osfcore.geometry.light import SpotLamp
-from osfcore.geometry.poses import Pose
+from osfcore.geometry.poses import Pose, fibonacci_sphere
 from osfcore.photo.lamp import TABLE, LitPixels, ShadedPixels, Shadows, fit_lamp, fit_near_lamp
 from osfcore.photo.pose_loss import Surfels
+from tests.support.errors import about
 
-# Lamp
+# A distant lamp, from shading alone.
 
 
-def ball(rng, count=3000):
+def ball(rng, count=1000):
     """Pixels of a ball that a camera along z sees: random albedo."""
     normals = fibonacci_sphere(2 * count)
     normals = normals[normals[:, 2] < 0]
@@ -24,7 +24,7 @@ def angle_deg(a, b):
     return np.rad2deg(np.arccos(np.clip(a @ b, -1, 1)))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_lamp_is_found_despite_ambient_light_colour_noise_and_highlights(seed):
     rng = np.random.default_rng(seed)
     normals, albedo = ball(rng)
@@ -49,20 +49,6 @@ def test_a_room_is_called_diffuse():
     assert found.is_diffuse
 
 
-def test_exposure_changes_the_strength_alone():
-    rng = np.random.default_rng(1)
-    normals, albedo = ball(rng)
-    radiance = albedo * (0.2 + 0.6 * np.maximum(normals @ np.array([0.6, 0, -0.8]), 0))[:, None]
-    one, half = (fit_lamp(ShadedPixels(g * radiance, albedo, normals)) for g in (1.0, 0.5))
-    assert angle_deg(one.direction, half.direction) < 0.2
-    np.testing.assert_allclose(half.strength, one.strength / 2, rtol=0.02)
-
-
-def test_few_pixels_are_refused():
-    with pytest.raises(InvalidInput, match="number of shaded pixels is 3"):
-        ShadedPixels(np.ones((3, 3)), np.ones((3, 3)), np.ones((3, 3)))
-
-
 # A near lamp from pixels of two balls on a table, made by the model in closed form.
 
 
@@ -70,7 +56,7 @@ BALLS = ((np.array([0.09, 0.0, 0.05]), 0.05), (np.array([-0.06, 0.08, 0.04]), 0.
 CENTRE = np.zeros(3)
 
 
-def ball_under_lamp(radius, count=6000):
+def ball_under_lamp(radius, count=3000):
     normals = fibonacci_sphere(count).astype(np.float32)
     spacing = radius * np.sqrt(4 * np.pi / count)
     return Surfels(radius * normals, normals, np.full_like(normals, 0.5), float(spacing))
@@ -83,12 +69,12 @@ def shadows():
 
 def surfaces(rng):
     """Points, normals and owners of what a camera above sees."""
-    table = np.column_stack([rng.uniform(-0.35, 0.35, (2500, 2)), np.zeros(2500)])
+    table = np.column_stack([rng.uniform(-0.35, 0.35, (1000, 2)), np.zeros(1000)])
     table = table[[all(np.linalg.norm(p[:2] - c[:2]) > r for c, r in BALLS) for p in table]]
     points, normals = [table], [np.tile([0.0, 0.0, 1.0], (len(table), 1))]
     owner = [np.full(len(table), TABLE)]
     for number, (centre, radius) in enumerate(BALLS):
-        normal = fibonacci_sphere(900)
+        normal = fibonacci_sphere(350)
         normal = normal[normal[:, 2] > -0.2]
         points.append(centre + radius * normal)
         normals.append(normal)
@@ -125,27 +111,24 @@ def scene(spot=None, direction=None, ambient=0.3, diffuse=0.7, gain=1.0, noise=0
     return LitPixels(radiance, albedo, points, normals, owner, np.arange(len(points)) % views, shadows())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("place", "cone"), [((0.3, -0.2, 0.4), (60, 75)), ((-0.5, 0.3, 0.35), (14, 22)), ((0.1, 0.6, 0.9), (12, 18))]
+    ("place", "cone"),
+    [
+        ((0.3, -0.2, 0.4), (60, 75)),
+        pytest.param((-0.5, 0.3, 0.35), (14, 22), marks=pytest.mark.slow),
+        pytest.param((0.1, 0.6, 0.9), (12, 18), marks=pytest.mark.slow),
+    ],
 )
-def test_place_and_cone_are_recovered(place, cone):
+def test_place_and_cone_are_recovered_within_their_deviations(place, cone):
     spot = SpotLamp(np.array(place), np.array([0.02, -0.01, 0.0]), *cone)
     found = fit_near_lamp(scene(spot), CENTRE)
     assert not found.is_diffuse
-    assert angle_deg(found.direction, spot.direction) < 2
     assert found.distance_known
-    assert abs(found.distance / spot.distance - 1) < 0.08
+    assert np.deg2rad(angle_deg(found.direction, spot.direction)) < min(np.deg2rad(2), 3 * found.std)
+    assert abs(np.log(found.distance / spot.distance)) < min(0.08, 3 * found.log_distance_std)
     assert angle_deg(found.lamp.direction, found.direction) < 1e-3
     if cone[1] < 45:
         assert abs(found.lamp.outer_deg - cone[1]) < 4
-
-
-def test_deviations_cover_the_errors():
-    spot = SpotLamp(np.array([0.4, 0.3, 0.5]), CENTRE, 60, 75)
-    found = fit_near_lamp(scene(spot, seed=1), CENTRE)
-    assert np.deg2rad(angle_deg(found.direction, spot.direction)) < 3 * found.std
-    assert abs(np.log(found.distance / spot.distance)) < 3 * found.log_distance_std
 
 
 def test_of_a_distant_lamp_the_distance_stays_unknown():
@@ -158,30 +141,20 @@ def test_of_a_distant_lamp_the_distance_stays_unknown():
 
 
 def test_light_from_everywhere_is_called_diffuse():
-    found = fit_near_lamp(scene(ambient=0.8), CENTRE)
-    assert found.is_diffuse
-    assert not found.distance_known
+    assert fit_near_lamp(scene(ambient=0.8), CENTRE).is_diffuse
 
 
-@pytest.mark.slow
-def test_strength_is_relative_to_the_exposure():
-    spot = SpotLamp(np.array([0.3, -0.2, 0.4]), CENTRE, 60, 75)
-    one, half = (fit_near_lamp(scene(spot, gain=g, noise=0.004 * g), CENTRE) for g in (1.0, 0.5))
-    np.testing.assert_allclose(half.strength, one.strength / 2, rtol=0.05)
-    np.testing.assert_allclose(one.strength, 0.7, rtol=0.15)
-    assert angle_deg(one.direction, half.direction) < 0.5
-
-
-def test_each_view_has_its_own_exposure():
+def test_strength_is_relative_to_the_exposure_of_each_view():
     spot = SpotLamp(np.array([0.3, -0.2, 0.4]), CENTRE, 60, 75)
     pixels = scene(spot, views=2)
     pixels.radiance[pixels.view == 1] *= 0.4
     found = fit_near_lamp(pixels, CENTRE)
     assert angle_deg(found.direction, spot.direction) < 2
+    np.testing.assert_allclose(found.strength[0], 0.7, rtol=0.15)
     np.testing.assert_allclose(found.strength[1], 0.4 * found.strength[0], rtol=0.1)
 
 
-def test_objects_alone_tell_the_direction():
+def test_objects_alone_show_the_direction():
     spot = SpotLamp(np.array([0.4, 0.3, 0.5]), CENTRE, 60, 75)
     whole = scene(spot)
     kept = whole.owner != TABLE
@@ -190,9 +163,12 @@ def test_objects_alone_tell_the_direction():
     assert angle_deg(fit_near_lamp(pixels, CENTRE).direction, spot.direction) < 4
 
 
-def test_few_pixels_are_refused_near_lamp():
-    with pytest.raises(InvalidInput, match="number of shaded pixels is 4"):
-        LitPixels(*(np.ones((4, 3)) for _ in range(4)), np.zeros(4, int), np.zeros(4, int), shadows())
+def test_few_pixels_are_refused():
+    four = [np.ones((4, 3))] * 4
+    with pytest.raises(InvalidInput, check=about("number of shaded pixels")):
+        LitPixels(*four, np.zeros(4, int), np.zeros(4, int), shadows())
+    with pytest.raises(InvalidInput, check=about("number of shaded pixels")):
+        ShadedPixels(*four[:3])
 
 
 @pytest.mark.parametrize("direction", [(0.6, 0.0, 0.8), (0.0, -0.8, 0.6)])

@@ -1,4 +1,4 @@
-"""Pose loss: surfels, object window."""
+"""Surfels of a field, windows of photographs, and the prior of a table."""
 
 from dataclasses import replace
 
@@ -7,10 +7,12 @@ import pytest
 from scipy.spatial import KDTree
 
 from osfcore.errors import InvalidInput
-from osfcore.geometry.poses import Pose
+from osfcore.estimation.objective import resting_orientations
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.photo.photograph import Photograph
-from osfcore.photo.pose_loss import PoseLoss, draw, object_windows, signed_distance, surfels_of
-from tests.core.photo.conftest import NAME
+from osfcore.photo.pose_loss import PoseLoss, TablePrior, draw, object_windows, signed_distance, surfels_of
+from tests.support.errors import about
+from tests.support.photographs import NAME
 
 # Surfels
 
@@ -20,55 +22,39 @@ def surfels(fields):
     return surfels_of(fields[NAME], 0.003)
 
 
-def test_they_lie_on_the_surface_and_look_outward(fields, surfels):
+def test_they_lie_on_the_surface_one_spacing_apart_and_look_outward(fields, surfels):
     low, high = fields[NAME].extent
     assert np.all((surfels.points >= low - 1e-3) & (surfels.points <= high + 1e-3))
     np.testing.assert_allclose(np.linalg.norm(surfels.normals, axis=1), 1, atol=1e-3)
     assert (np.einsum("ij,ij->i", surfels.normals, surfels.points) > 0).mean() > 0.99
     assert np.all((surfels.albedo >= 0) & (surfels.albedo < 1.5))
-
-
-def test_their_distance_is_the_spacing(surfels):
     nearest = KDTree(surfels.points).query(surfels.points, k=2)[0][:, 1]
     assert 0.4 * surfels.spacing < np.median(nearest) < 1.2 * surfels.spacing
 
 
 def test_they_draw_the_silhouette_and_the_depth_of_the_field(surfels, taken):
     window = object_windows([taken.photo], NAME, 1000)[0]
-    index, depth = draw(surfels, window, Pose(taken.pose.position[None], taken.pose.quaternion[None]))
+    index, depth = draw(surfels, window, taken.pose[None])
     shown = index[0] >= 0
     assert (shown & window.mask).sum() / (shown | window.mask).sum() > 0.95
     truth = window.frame.cut(taken.depth)
-    common = shown & window.mask
-    assert np.median(np.abs(depth[0] - truth)[common]) < 2e-3
+    assert np.median(np.abs(depth[0] - truth)[shown & window.mask]) < 2e-3
 
 
-@pytest.mark.slow
-def test_the_true_pose_has_a_small_loss(surfels, taken):
-    loss = PoseLoss(object_windows([taken.photo], NAME, 60), surfels)
+def test_the_true_pose_has_the_least_loss_at_any_exposure(surfels, taken):
     steps = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.05]])
     poses = Pose(taken.pose.position + steps, np.tile(taken.pose.quaternion, (4, 1)))
-    terms = loss.terms(poses)
+    darker = replace(taken.photo, image=np.float32(0.5) * taken.photo.image)
+    terms, dark = (PoseLoss(object_windows([p], NAME, 60), surfels).terms(poses) for p in (taken.photo, darker))
     assert np.argmin(terms.losses) == 0
     assert terms.iou[0] > 0.94
     assert terms.correlation[0] > 0.8
+    assert dark.losses[0] == pytest.approx(terms.losses[0], abs=1e-3)
+    outlines = PoseLoss(object_windows([taken.photo], NAME, 60), surfels, kind="iou")
+    np.testing.assert_allclose(outlines(poses), 1 - terms.iou, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_the_loss_knows_nothing_of_exposure(surfels, taken):
-    darker = replace(taken.photo, image=np.float32(0.5) * taken.photo.image)
-    pose = Pose(taken.pose.position[None], taken.pose.quaternion[None])
-    first, second = (PoseLoss(object_windows([p], NAME, 60), surfels).terms(pose) for p in (taken.photo, darker))
-    assert second.losses[0] == pytest.approx(first.losses[0], abs=1e-3)
-
-
-def test_the_outline_alone_counts_if_asked(surfels, taken):
-    loss = PoseLoss(object_windows([taken.photo], NAME, 60), surfels, kind="iou")
-    terms = loss.terms(Pose(taken.pose.position[None], taken.pose.quaternion[None]))
-    np.testing.assert_allclose(terms.losses, 1 - terms.iou, atol=1e-12)
-
-
-# Object window
+# Windows
 
 
 K = np.array([[200.0, 0, 64], [0, 200, 48], [0, 0, 1]])
@@ -85,8 +71,11 @@ def rectangle(top, bottom, left, right):
     return mask
 
 
+INSIDE = rectangle(30, 60, 40, 60)
+
+
 def test_a_window_looks_along_the_same_rays():
-    window = object_windows([photo(a=rectangle(30, 60, 40, 60))], "a", 15)[0]
+    window = object_windows([photo(a=INSIDE)], "a", 15)[0]
     point = np.array([0.02, -0.01, 0.5])
     pixel, own = K @ point, window.intrinsics @ point
     frame = window.frame
@@ -94,36 +83,54 @@ def test_a_window_looks_along_the_same_rays():
     np.testing.assert_allclose(own[:2] / own[2], (pixel[:2] / pixel[2] - [frame.left, frame.top]) * scale, atol=1e-12)
 
 
-def test_what_another_object_may_hide_is_not_known():
-    window = object_windows([photo(a=rectangle(30, 60, 40, 60), b=rectangle(30, 60, 60, 80))], "a", 100)[0]
+def test_what_another_object_may_hide_or_lies_beyond_the_photo_is_not_known():
+    window = object_windows([photo(a=INSIDE, b=rectangle(30, 60, 60, 80))], "a", 100)[0]
     columns = np.arange(window.size[1]) + window.frame.left
     assert not window.known[15, (columns >= 61) & (columns < 70)].any()
     assert window.known[window.mask].all()
-
-
-def test_what_lies_beyond_the_photo_is_not_known():
+    assert window.cut == 0
     window = object_windows([photo(a=rectangle(0, 40, 40, 60))], "a", 100)[0]
-    rows = np.arange(window.size[0]) + window.frame.top
-    assert not window.known[rows < 0].any()
+    assert not window.known[np.arange(window.size[0]) + window.frame.top < 0].any()
     assert window.cut > 0.1
 
 
-def test_an_object_within_the_photo_is_not_cut():
-    assert object_windows([photo(a=rectangle(30, 60, 40, 60))], "a", 100)[0].cut == 0
-
-
 def test_distances_to_a_straight_border():
-    distances = signed_distance(rectangle(0, 96, 0, 64))
-    np.testing.assert_allclose(
-        distances[50], np.concatenate([np.arange(64, 0, -1) - 0.5, -(np.arange(64) + 0.5)]), atol=1e-12
-    )
+    expected = np.concatenate([np.arange(64, 0, -1) - 0.5, -(np.arange(64) + 0.5)])
+    np.testing.assert_allclose(signed_distance(rectangle(0, 96, 0, 64))[50], expected, atol=1e-12)
 
 
-def test_an_object_without_a_mask_is_told():
-    with pytest.raises(InvalidInput, match="mask of mug is missing"):
-        object_windows([photo(a=rectangle(30, 60, 40, 60))], "mug", 40)
+def test_objects_with_few_pixels_or_none_are_refused():
+    for name in ("mug", "a"):
+        with pytest.raises(InvalidInput, check=about(f"mask of {name}")):
+            object_windows([photo(a=rectangle(30, 32, 40, 42))], name, 40)
 
 
-def test_a_mask_of_few_pixels_is_told():
-    with pytest.raises(InvalidInput, match="size of the mask of a is 4 pixels"):
-        object_windows([photo(a=rectangle(30, 32, 40, 42))], "a", 40)
+# The prior of a table
+
+
+@pytest.fixture(scope="module")
+def lying(fields):
+    resting = resting_orientations(fields[NAME])
+    pose = Pose(np.zeros(3), resting.quaternions[0])
+    return TablePrior(resting), Pose(np.array([0.1, 0.2, -resting.lowest(pose)]), resting.quaternions[0])
+
+
+def test_what_stands_on_the_table_pays_nothing_and_the_rest_a_bounded_price(lying):
+    prior, pose = lying
+    high = Pose(pose.position + [0, 0, 0.3], pose.quaternion)
+    leaning = Pose(high.position, quaternion_multiply(quaternion_exp(np.array([0.7, 0, 0])), pose.quaternion))
+    penalties = prior.penalties(Pose.stacked([pose, high, leaning]))
+    assert penalties[0] < 0.1
+    np.testing.assert_allclose(penalties[1:], [100 + penalties[0], 200], rtol=0.1)
+
+
+def test_a_gauss_newton_step_brings_it_back_to_the_table(lying):
+    prior, pose = lying
+    turn = quaternion_exp(np.array([0.03, -0.05, 0.4]))
+    moved = Pose(pose.position + [0, 0, 6e-3], quaternion_multiply(turn, pose.quaternion))
+    before = prior.penalties(moved[None])[0]
+    for _ in range(3):
+        normal, right = prior.normal_equations(moved)
+        step = np.linalg.solve(normal + 1e-6 * np.eye(6), right)
+        moved = Pose(moved.position + step[:3], quaternion_multiply(quaternion_exp(step[3:]), moved.quaternion))
+    assert prior.penalties(moved[None])[0] < 0.05 * before

@@ -1,4 +1,4 @@
-"""Poses: estimate photo, occlusion, pose search, table from objects."""
+"""Poses of objects in photographs, and the table that they lie on."""
 
 from dataclasses import replace
 
@@ -25,11 +25,15 @@ from osfcore.photo.poses import (
     poses_from_mask,
     super_fibonacci,
     table_from_objects,
+    table_from_points,
     without_others,
 )
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
-from tests.core.photo.conftest import NAME, take
+from tests.support.errors import about
+from tests.support.photographs import NAME, take
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 # Poses and light of an object in a photograph of unknown exposure, white balance and lamp.
 
@@ -44,44 +48,23 @@ def found_in(models, photo, name, config=None):
     return last.found[0]
 
 
-def errors(found, pose):
-    turned = rotation_angle(found.best.pose.quaternion, pose.quaternion)
-    return np.linalg.norm(found.best.pose.position - pose.position), np.rad2deg(turned)
-
-
-@pytest.fixture(scope="module")
-def found(models, taken):
-    return found_in(models, taken.photo, NAME)
-
-
-@pytest.mark.usefixtures("one_thread")
 @pytest.mark.slow
-def test_without_a_start(found, taken):
-    distance, turned = errors(found, taken.pose)
-    assert distance < 8e-3
-    assert turned < 3
-    assert found.doubt == ""
-    assert found.ratio > 1.15
-
-
-@pytest.mark.usefixtures("one_thread")
-@pytest.mark.slow
-def test_from_a_start_two_centimetres_and_fifteen_degrees_off(models, taken):
+@pytest.mark.parametrize("is_started", [False, True])
+def test_poses_are_found_without_a_start_and_from_one_2_cm_and_15_degrees_off(models, taken, is_started):
     turn = quaternion_exp(np.deg2rad(15) * np.array([0.6, 0, 0.8]))
     start = Pose(taken.pose.position + [0.012, 0.0, 0.016], quaternion_multiply(turn, taken.pose.quaternion))
-    distance, turned = errors(found_in(models, taken.photo, NAME, PhotoConfig({NAME: start})), taken.pose)
-    assert distance < 8e-3
-    assert turned < 3
+    found = found_in(models, taken.photo, NAME, PhotoConfig({NAME: start} if is_started else {}))
+    assert np.linalg.norm(found.best.pose.position - taken.pose.position) < 8e-3
+    assert np.rad2deg(rotation_angle(found.best.pose.quaternion, taken.pose.quaternion)) < 3
+    assert is_started or found.doubt == ""
 
 
-@pytest.mark.usefixtures("one_thread")
 @pytest.mark.slow
 def test_a_wrong_name_is_doubted(models, taken):
     photo = replace(taken.photo, masks={"006_mustard_bottle": taken.photo.masks[NAME]})
     assert found_in(models, photo, "006_mustard_bottle").doubt
 
 
-@pytest.mark.usefixtures("one_thread")
 def test_the_lamp_by_the_shading_of_a_bottle(models, fields):
     bottle = "006_mustard_bottle"
     taken = take(fields, bottle, light=(0.7, -0.5, -0.4))
@@ -91,23 +74,13 @@ def test_the_lamp_by_the_shading_of_a_bottle(models, fields):
     assert np.rad2deg(np.arccos(light.direction @ taken.light)) < 12
 
 
-@pytest.mark.usefixtures("one_thread")
-def test_an_object_without_a_field_is_told(models, taken):
+def test_objects_without_a_field_and_photos_without_a_common_table_are_refused(models, taken):
     photo = replace(taken.photo, masks={"teapot": taken.photo.masks[NAME]})
-    with pytest.raises(UnknownName, match="no field named 'teapot'"):
+    with pytest.raises(UnknownName, check=about("teapot")):
         found_in(models, photo, "teapot")
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_photos_without_a_common_table_are_told(models, taken):
-    with pytest.raises(InvalidInput, match="number of photos is 2, 0 of them with a known table"):
-        next(estimate_photo(models, [taken.photo, taken.photo], [NAME], np.random.default_rng(0)))
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_no_photo_is_told(models):
-    with pytest.raises(InvalidInput, match="number of photos is 0"):
-        next(estimate_photo(models, [], [NAME], np.random.default_rng(0)))
+    for photos in ([taken.photo, taken.photo], []):
+        with pytest.raises(InvalidInput, check=about("number of photos")):
+            next(estimate_photo(models, photos, [NAME], np.random.default_rng(0)))
 
 
 # Masks that lack a part of what stands in front, or hold a part of it.
@@ -137,7 +110,6 @@ def spoiled(taken):
     return replace(taken.photo, masks={NAME: front, BEHIND: behind})
 
 
-@pytest.mark.usefixtures("one_thread")
 def test_what_is_drawn_is_added_to_the_others_and_taken_from_the_own_mask(taken, spoiled, surfels):
     found = [at(taken.pose), at(Pose.identity(), BEHIND, iou=0.5)]
     (seen,) = without_others([spoiled], BEHIND, found, surfels)
@@ -145,22 +117,12 @@ def test_what_is_drawn_is_added_to_the_others_and_taken_from_the_own_mask(taken,
     assert (seen.masks[NAME] & whole).sum() / (seen.masks[NAME] | whole).sum() > 0.95
     assert seen.masks[BEHIND][:20, :20].all()
     assert seen.masks[BEHIND].sum() < 400 + 0.05 * spoiled.masks[BEHIND].sum()
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_an_outline_that_fits_badly_takes_nothing_from_the_own_mask(taken, spoiled, surfels):
-    found = [at(taken.pose, iou=0.5), at(Pose.identity(), BEHIND, iou=0.5)]
+    found[0] = at(taken.pose, iou=0.5)  # an outline that fits badly takes nothing
     (seen,) = without_others([spoiled], BEHIND, found, surfels)
     np.testing.assert_array_equal(seen.masks[BEHIND], spoiled.masks[BEHIND])
+    assert without_others([taken.photo], BEHIND, found, surfels) == [taken.photo]
 
 
-@pytest.mark.usefixtures("one_thread")
-def test_photographs_without_the_object_are_left_as_they_are(taken, surfels):
-    (seen,) = without_others([taken.photo], BEHIND, [at(taken.pose)], surfels)
-    assert seen is taken.photo
-
-
-@pytest.mark.usefixtures("one_thread")
 @pytest.mark.slow
 def test_an_object_behind_another_of_which_half_is_marked(models, fields, taken):
     """The box hides the bottle's lower half, but only the box's own lower half is marked: both are looked for twice."""
@@ -205,19 +167,15 @@ def test_outlines_are_put_where_the_mask_is(fields, taken):
     assert np.abs(centres - window.centroid).max() < 2
 
 
-def test_steps_are_taken_along_the_cameras_axes(taken):
+def test_steps_are_taken_along_the_cameras_axes_around_the_given_pose(taken):
     window = object_windows([taken.photo], NAME, 44)[0]
     steps = np.array([[0.01, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]])
     poses = moved(taken.pose, window, steps)
+    around = poses_around(taken.pose, window, 20, np.random.default_rng(0))
+    np.testing.assert_allclose(around.position[0], taken.pose.position, atol=1e-12)
     np.testing.assert_allclose(poses.position[0] - taken.pose.position, [0.01, 0, 0], atol=1e-12)
     np.testing.assert_allclose(poses.position[1], taken.pose.position, atol=1e-12)
     np.testing.assert_allclose(rotation_angle(poses.quaternion[1], taken.pose.quaternion), 0.2, atol=1e-12)
-
-
-def test_the_given_pose_is_among_those_around_it(taken):
-    window = object_windows([taken.photo], NAME, 44)[0]
-    poses = poses_around(taken.pose, window, 20, np.random.default_rng(0))
-    np.testing.assert_allclose(poses.position[0], taken.pose.position, atol=1e-12)
 
 
 def test_distinct_poses_are_the_best_and_differ():
@@ -243,7 +201,7 @@ def standing(resting, number, x, y):
     return T_CAMERA_WORLD @ Pose(np.array([x, y, -resting.lowest(turned)]), turned.quaternion)
 
 
-def test_objects_that_stand_on_a_table_tell_where_it_is(resting):
+def test_objects_that_stand_on_a_table_show_where_it_is(resting):
     poses = [standing(r, k, 0.1 * k, -0.05 * k) for k, r in enumerate(resting)]
     found = table_from_objects([TablePrior(r) for r in resting], poses)
     assert found.supported == (0, 1)
@@ -253,19 +211,18 @@ def test_objects_that_stand_on_a_table_tell_where_it_is(resting):
     assert found.spread_deg < 2
 
 
-def test_errors_of_the_poses_average_out(resting):
-    rng = np.random.default_rng(1)
-    both = [r for r in resting for _ in range(3)]
-    poses = []
-    for k, r in enumerate(both):
-        turn = quaternion_exp(np.deg2rad(4) * rng.normal(size=3) / np.sqrt(3))
-        pose = standing(r, k % 24, *rng.uniform(-0.2, 0.2, 2))
-        poses.append(Pose(pose.position, quaternion_multiply(turn, pose.quaternion)))
-    found = table_from_objects([TablePrior(r) for r in both], poses)
-    up = found.T_world_camera.inverse().matrix()[:3, 2]
-    true = T_CAMERA_WORLD.matrix()[:3, 2]
-    assert np.rad2deg(np.arccos(up @ true)) < 4
-
-
-def test_one_object_does_not_tell(resting):
+def test_one_object_alone_or_scattered_points_give_no_table(resting):
     assert table_from_objects([TablePrior(resting[0])], [standing(resting[0], 0, 0, 0)]) is None
+    with pytest.raises(InvalidInput, check=about("points on one plane")):
+        table_from_points(np.random.default_rng(0).uniform(-1, 1, (500, 3)), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_on_the_table_get_height_zero_despite_outliers(seed):
+    rng = np.random.default_rng(seed)
+    T_camera_world = Pose(np.array([0.1, 0, 0.8]), quaternion_exp(np.array([2.4, 0.2 * rng.normal(), 0.1])))
+    flat = np.concatenate([rng.uniform(-0.3, 0.3, (500, 2)), rng.normal(0, 1e-3, (500, 1))], axis=1)
+    points = np.concatenate([T_camera_world.apply(flat), rng.uniform(-0.3, 1, (200, 3))])
+    found = table_from_points(points, rng)
+    assert np.abs(found.apply(points[:500])[:, 2]).max() < 6e-3
+    assert found.position[2] > 0.3  # the camera is above

@@ -1,5 +1,8 @@
 import io
 import struct
+import sys
+import threading
+import warnings
 import zlib
 
 import cv2
@@ -21,6 +24,7 @@ from osfcore.photo.read_photograph import (
     read_photograph,
     to_photograph,
 )
+from tests.support.errors import about
 
 register_heif_opener()
 DIAGONAL_MM = 43.27  # of film, to which equivalent focal lengths refer
@@ -73,19 +77,13 @@ def test_every_kind_of_png_is_understood(mode):
     assert seen.notes == ()
 
 
-@given(height=st.integers(MIN_SIDE, 80), width=st.integers(MIN_SIDE, 80), channels=st.sampled_from([1, 3]))
-def test_sixteen_bits_stay_sixteen_bits(height, width, channels):
-    values = np.random.default_rng(height).integers(0, 65536, (height, width, channels), np.uint16)
-    seen = read_photograph(sixteen_bit_png(values)).encoded
-    np.testing.assert_array_equal(seen, np.broadcast_to(values, (height, width, 3)))
-
-
-def test_sixteen_bits_keep_dark_tones_apart_that_eight_cannot():
-    values = np.full((64, 64, 3), 1000, np.uint16) + np.arange(64, dtype=np.uint16)[:, None]
+@pytest.mark.parametrize("channels", [1, 3])
+def test_sixteen_bits_keep_dark_tones_apart_that_eight_cannot(channels):
+    values = np.full((64, 40, channels), 1000, np.uint16) + np.arange(64, dtype=np.uint16)[:, None, None]
     raw = read_photograph(sixteen_bit_png(values))
-    seen = to_photograph(raw, intrinsics_from_focal(64, 64, 64.0))
-    np.testing.assert_allclose(seen.image, linear_of_srgb(values / 65535), rtol=1e-6)
-    assert len(np.unique(seen.image)) == 64
+    np.testing.assert_array_equal(raw.encoded, np.broadcast_to(values, (64, 40, 3)))
+    seen = to_photograph(raw, intrinsics_from_focal(40, 64, 64.0))
+    np.testing.assert_allclose(seen.image, np.broadcast_to(linear_of_srgb(values / 65535), (64, 40, 3)), rtol=1e-6)
     assert len(np.unique(raw.eight_bit)) == 1
 
 
@@ -95,19 +93,16 @@ def test_transparent_parts_are_white_and_it_is_said():
     alpha[:, :32], alpha[:, 32:64] = 0, 128
     image.putalpha(Image.fromarray(alpha))
     seen = read_photograph(encoded(image))
-    assert seen.notes == ("Transparent parts of the photo were taken for white.",)
+    assert len(seen.notes) == 1
     share = alpha[..., None] / 255
     np.testing.assert_allclose(seen.encoded, share * blocks() + 255 * (1 - share), atol=1)
 
-
-def test_sixteen_bits_may_be_transparent_too():
     values = np.dstack([blocks(dtype=np.uint16), np.full((64, 96), 32768, np.uint16)])
     seen = read_photograph(sixteen_bit_png(values)).encoded
-    assert seen.dtype == np.uint16
     np.testing.assert_allclose(seen, (values[..., :3].astype(float) + 65535) / 2, atol=2)
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "HEIF", "WEBP", "AVIF", "TIFF", "BMP"])
+@pytest.mark.parametrize("kind", ["JPEG", "HEIF", "WEBP", "AVIF", "TIFF", "BMP", "GIF"])
 def test_every_usual_format_is_understood(kind):
     seen = read_photograph(encoded(Image.fromarray(blocks()), kind, quality=95)).encoded
     assert seen.dtype == np.uint8
@@ -134,19 +129,14 @@ def test_photos_stand_upright(orientation):
     seen = read_photograph(encoded(Image.fromarray(stored), exif=exif(orientation)))
     np.testing.assert_array_equal(seen.encoded, blocks())
     assert seen.sent_size == (96, 64)
-
-
-def test_sixteen_bits_stand_upright_too():
-    stored = np.rot90(blocks(dtype=np.uint16)[..., 0])
-    seen = read_photograph(encoded(Image.fromarray(np.ascontiguousarray(stored)), exif=exif(6)))
+    wide = np.ascontiguousarray(turned_by(orientation, blocks(dtype=np.uint16))[..., 0])
+    seen = read_photograph(encoded(Image.fromarray(wide), exif=exif(orientation)))
     np.testing.assert_array_equal(seen.encoded[..., 0], blocks(dtype=np.uint16)[..., 0])
 
 
-@pytest.mark.parametrize("turned", [1, 6])
-def test_heic_of_a_phone_stands_upright(turned):
-    stored = Image.fromarray(np.ascontiguousarray(turned_by(turned, blocks())))
-    seen = read_photograph(encoded(stored, "HEIF", quality=95, exif=exif(turned, FocalLengthIn35mmFilm=26)))
-    assert seen.sent_size == (96, 64)
+def test_heic_of_a_phone_stands_upright_and_has_its_focal_length():
+    stored = Image.fromarray(np.ascontiguousarray(turned_by(6, blocks())))
+    seen = read_photograph(encoded(stored, "HEIF", quality=95, exif=exif(6, FocalLengthIn35mmFilm=26)))
     assert np.abs(seen.encoded.astype(int) - blocks()).mean() < 8
     assert seen.focal_px == pytest.approx(26 / DIAGONAL_MM * np.hypot(96, 64))
 
@@ -157,7 +147,7 @@ def test_large_photos_are_reduced_and_it_is_said(kind):
     seen = read_photograph(encoded(image, kind, exif=exif(FocalLengthIn35mmFilm=26)))
     height, width = seen.encoded.shape[:2]
     assert (width, height) == (KEPT_SIDE, 164)
-    assert seen.notes == ("The photo was reduced from 5000 x 400 to 2048 x 164 pixels.",)
+    assert "5000 x 400" in seen.notes[0]
     assert np.abs(seen.encoded.mean((0, 1)) - [200, 100, 50]).max() < 4
     assert seen.focal_px == pytest.approx(26 / DIAGONAL_MM * np.hypot(width, height))
 
@@ -185,7 +175,7 @@ def exchanged_profile():
 def test_colours_of_another_profile_are_converted():
     seen = read_photograph(encoded(Image.fromarray(blocks()), icc_profile=exchanged_profile()))
     np.testing.assert_allclose(seen.encoded, blocks()[..., ::-1].astype(int), atol=2)
-    assert seen.notes == ("The photo's colours were converted from xBGR built-in to sRGB.",)
+    assert "xBGR" in seen.notes[0]
 
 
 @pytest.mark.parametrize(("profile", "encoding"), [(srgb_profile(), "srgb"), (exchanged_profile(), "linear")])
@@ -199,7 +189,7 @@ def test_colours_stay_if_the_profile_is_srgb_or_the_file_is_linear(profile, enco
 def test_a_profile_that_makes_no_sense_changes_nothing(profile):
     seen = read_photograph(encoded(Image.fromarray(blocks()), icc_profile=profile))
     np.testing.assert_array_equal(seen.encoded, blocks())
-    assert seen.notes == ("The photo's colour profile cannot be understood; its colours are taken for sRGB.",)
+    assert len(seen.notes) == 1
 
 
 # Focal length
@@ -210,10 +200,14 @@ def test_the_equivalent_focal_length_refers_to_the_diagonal(f35, width, height):
     seen = read_photograph(encoded(Image.new("RGB", (width, height)), exif=exif(FocalLengthIn35mmFilm=f35)))
     diagonal_deg = 2 * np.rad2deg(np.arctan(DIAGONAL_MM / 2 / f35))
     assert 2 * np.rad2deg(np.arctan(np.hypot(width, height) / 2 / seen.focal_px)) == pytest.approx(diagonal_deg)
+    K, _ = guessed_intrinsics(seen)
+    np.testing.assert_allclose(K, intrinsics_from_focal(width, height, seen.focal_px), atol=1e-12)
+    with pytest.raises(InvalidInput, check=about("focal length")):
+        intrinsics_from_focal(width, height, np.nan)
 
 
 @pytest.mark.parametrize(("unit", "px_per_unit"), [(2, 25.4 * 20), (3, 10 * 20), (None, 25.4 * 20)])
-def test_a_sensor_of_known_resolution_tells_the_focal_length(unit, px_per_unit):
+def test_a_sensor_of_known_resolution_gives_the_focal_length(unit, px_per_unit):
     camera = {"FocalLength": 4.5, "FocalPlaneXResolution": px_per_unit, "FocalPlaneYResolution": px_per_unit}
     if unit:
         camera["FocalPlaneResolutionUnit"] = unit
@@ -226,62 +220,40 @@ def test_a_sensor_of_known_resolution_tells_the_focal_length(unit, px_per_unit):
     [
         {},
         {"FocalLength": 4.5},
-        {"FocalLengthIn35mmFilm": 0},
         {"FocalLengthIn35mmFilm": 60_000},
         {"FocalLength": 4.5, "FocalPlaneXResolution": 0.0},
         {"FocalLength": 4.5, "FocalPlaneXResolution": 100.0, "FocalPlaneResolutionUnit": 77},
     ],
 )
-def test_what_exif_does_not_tell_is_not_known(camera):
+def test_without_exif_the_focal_length_is_assumed(camera):
     seen = read_photograph(encoded(Image.fromarray(blocks()), "JPEG", exif=exif(**camera)))
     assert seen.focal_px is None
-    K, note = guessed_intrinsics(seen)
-    assert "does not tell its focal length; that of a phone's main camera is assumed (75 degrees" in note
+    K, _ = guessed_intrinsics(seen)
     assert 2 * np.rad2deg(np.arctan(np.hypot(96, 64) / 2 / K[0, 0])) == pytest.approx(75)
-
-
-def test_what_exif_tells_is_taken():
-    seen = read_photograph(encoded(Image.fromarray(blocks()), exif=exif(FocalLengthIn35mmFilm=26)))
-    K, note = guessed_intrinsics(seen)
-    np.testing.assert_allclose(K, intrinsics_from_focal(96, 64, seen.focal_px), atol=1e-12)
-    assert note == "The focal length, 69 pixels, is what the camera wrote into the photo."
-
-
-def test_a_camera_looks_through_the_middle_of_its_image():
-    K = intrinsics_from_focal(640, 480, 600.0)
-    np.testing.assert_array_equal(K @ [0, 0, 1], [320, 240, 1])
-    for focal in (0.0, -600.0, np.nan, 1e9):
-        with pytest.raises(InvalidInput, match=r"focal length \[px\]"):
-            intrinsics_from_focal(640, 480, focal)
 
 
 # Refusals
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "why"),
     [
-        (b"", "it is no picture that can be read here; send a JPEG, PNG"),
-        (b"Dear reader, this is a letter.", "it is no picture that can be read here; send a JPEG, PNG"),
-        (b"%PDF-1.7 ...", "no picture"),
-        (png_head(20_000, 12_000), "it has 20000 x 12000 pixels; 200 million are allowed"),
-        (png_head(100_000, 100_000), "it has far too many pixels; 200 million are allowed"),
-        (png_head(16, 400), "it has 16 x 400 pixels; at least 32 a side are needed"),
-        (png_head(64, 64), "it is damaged or incomplete, and cannot be decoded; send it anew"),
+        (b"", "no picture"),
+        (b"Dear reader, this is a letter.", "no picture"),
+        (png_head(20_000, 12_000), "20000 x 12000"),
+        (png_head(100_000, 100_000), "too many pixels"),
+        (png_head(16, 400), "16 x 400"),
+        (png_head(64, 64), "damaged"),
     ],
 )
-def test_what_is_no_photo_is_told_so(data, words, tmp_path):
-    with pytest.raises(CorruptFile, match=f"^The photo cannot be used: .*{words}"):
+def test_what_is_no_photo_is_refused(data, why, tmp_path):
+    with pytest.raises(CorruptFile, check=about(why)):
         read_photograph(data)
     path = tmp_path / "desk.png"
-    path.write_bytes(data)
-    with pytest.raises(CorruptFile, match=f"desk.png cannot be used: .*{words}"):
-        read_photograph(path)
-
-
-def test_a_file_that_is_not_there_is_told_so(tmp_path):
-    with pytest.raises(CorruptFile, match=r"desk\.jpg cannot be used: No such file"):
-        read_photograph(tmp_path / "desk.jpg")
+    for _ in range(2):  # a file that is missing, then one that is wrong
+        with pytest.raises(CorruptFile, check=about("desk.png")):
+            read_photograph(path)
+        path.write_bytes(data)
 
 
 @pytest.mark.parametrize(
@@ -294,17 +266,56 @@ def test_a_file_that_is_not_there_is_told_so(tmp_path):
     ],
     ids=["PNG", "JPEG", "HEIF", "16 bit"],
 )
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_a_photo_that_was_cut_off_is_refused(whole, share):
-    with pytest.raises(CorruptFile, match="cannot be used: it is"):
-        read_photograph(whole[: int(share * len(whole))])
+def test_a_photo_that_was_cut_off_is_refused(whole):
+    for share in (0.1, 0.5, 0.9):
+        with pytest.raises(CorruptFile):
+            read_photograph(whole[: int(share * len(whole))])
 
 
-def test_a_limit_of_other_code_on_pictures_is_left_as_it_was():
-    before = Image.MAX_IMAGE_PIXELS
-    read_photograph(encoded(Image.fromarray(blocks())))
-    after = Image.MAX_IMAGE_PIXELS
-    assert after == before
+def test_the_limit_of_other_code_on_pictures_is_neither_heeded_nor_touched(monkeypatch):
+    """Pillow's own limit belongs to all threads: another one may read it at any moment."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    seen = set()
+    photos = [
+        encoded(Image.fromarray(blocks()), kind) for kind in ("PNG", "JPEG", "HEIF", "AVIF", "TIFF", "BMP", "GIF")
+    ]
+    photos.append(encoded(Image.fromarray(blocks()), "TIFF", compression="tiff_deflate"))
+    sys.setprofile(lambda *_: seen.add(Image.MAX_IMAGE_PIXELS))
+    try:
+        for photo in photos:
+            read_photograph(photo)
+    finally:
+        sys.setprofile(None)
+    assert seen == {1000}
+
+
+def test_threads_that_read_at_once_ignore_odd_metadata_and_restore_the_filters_of_warnings():
+    """The first is still decoding when the second begins, and ends before it."""
+    odd = encoded(Image.fromarray(blocks()), "JPEG", exif=b"Exif\0\0II*\0\x08\0\0\0\x05\0cut")
+    with pytest.warns(UserWarning, match="EXIF"), Image.open(io.BytesIO(odd)) as image:
+        image.getexif().get(ExifTags.Base.Orientation)
+    before, photos = (Image.MAX_IMAGE_PIXELS, list(warnings.filters)), []
+    decoding, finish = [threading.Event(), threading.Event()], [threading.Event(), threading.Event()]
+
+    def read(number):
+        def pause(frame, event, _):
+            if event == "call" and frame.f_code.co_name == "load":
+                sys.setprofile(None)
+                decoding[number].set()
+                finish[number].wait(60)
+
+        sys.setprofile(pause)
+        photos.append(read_photograph(odd))
+
+    threads = [threading.Thread(target=read, args=(number,)) for number in range(2)]
+    for number, thread in enumerate(threads):
+        thread.start()
+        assert decoding[number].wait(60)
+    for number, thread in enumerate(threads):
+        finish[number].set()
+        thread.join()
+    assert len(photos) == 2
+    assert (Image.MAX_IMAGE_PIXELS, warnings.filters) == before
 
 
 # Radiance
@@ -320,15 +331,6 @@ def test_photographs_are_linear_and_know_where_they_are_exposed_well():
     assert seen.well_exposed.sum() == 64 * 64 - 2
     assert not seen.on_table
     np.testing.assert_array_equal(seen.T_world_camera.matrix(), np.eye(4))
-
-
-def test_eight_and_sixteen_bits_agree():
-    eight = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8)
-    K = intrinsics_from_focal(40, 40, 40.0)
-    one = to_photograph(read_photograph(encoded(Image.fromarray(eight))), K)
-    other = to_photograph(read_photograph(sixteen_bit_png(eight.astype(np.uint16) * 257)), K)
-    np.testing.assert_allclose(other.image, one.image, atol=1e-6)
-    np.testing.assert_array_equal(other.well_exposed, one.well_exposed)
 
 
 def test_linear_files_stay_as_they_are():
