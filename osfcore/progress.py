@@ -1,11 +1,11 @@
-"""The step that every long piece of work yields, so that progress, cancelling and tests need nothing else."""
+"""The step that every long piece of work yields; progress, cancelling and tests need nothing else."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a piece of work is.
+    """Progress of a piece of work.
 
     Attributes:
         done: units finished.

@@ -25,7 +25,7 @@ class DynamicsModel(Protocol):
     def rollout(
         self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: SceneState | None = None
     ) -> Rollouts:
-        """Predicted poses under K sequences of T actions.
+        """Predict poses under K sequences of T actions.
 
         Args:
             state: of the scene, with its pusher.

@@ -53,7 +53,7 @@ from osfcore.io.files import write_atomically
 #
 # Deviation: eq. 8 compares a squared distance with a length; we compare the distance of two objects with kappa =
 # the longest half-extents of both + one step of pusher travel. Among the pairs that pass, and between pusher and
-# objects, outlines seen from above (`contact_geometry`) then decide which can touch within one substep. Only
+# objects, outlines seen from above (`shapes`) then decide which can touch within one substep. Only
 # objects that the pusher can touch, or that move, or that can be touched by one of these, take part; all others
 # stay exactly where they are.
 
@@ -102,7 +102,7 @@ class Graph(NamedTuple):
 def adjacency(
     position: Float[Tensor, "B N 3"], half_extent: Float[Tensor, "B N"], travel_m: float = TRAVEL_M
 ) -> Bool[Tensor, "B N N"]:
-    """Which objects could collide during a step (paper eq. 8, see the module for the deviation).
+    """Return which objects could collide during a step (paper eq. 8, with the deviation stated above).
 
     Args:
         position: of the centres [m].
@@ -115,7 +115,7 @@ def adjacency(
 
 
 def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Graph:
-    """The objects that may move in this substep, and the pairs of them that may touch.
+    """Return the objects that may move in this substep, and the pairs of them that may touch.
 
     Args:
         table: shapes of the objects.
@@ -148,7 +148,7 @@ def build_graph(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, s
 
 
 def _near_pusher(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep) -> Bool[Tensor, "B N"]:
-    """Objects that their extent toward the pusher's path does not rule out as touched: a cheap upper bound."""
+    """Return which objects the pusher may touch by their extent toward its path: a cheap upper bound."""
     away = motion.pusher[:, None] - motion.centre[..., :2]
     shift = sweep.shift[:, None]
     along = (-dot(away, shift) / (dot(shift, shift) + 1e-12)).clamp(0, 1)
@@ -161,7 +161,7 @@ def _near_pusher(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, 
 
 
 def _candidate_pairs(table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion) -> Bool[Tensor, "B N N"]:
-    """Pairs that could collide (eq. 8) and are not clear of each other along the line between their centres."""
+    """Return pairs that could collide (eq. 8) and are not clear of each other along the line between their centres."""
     radius = table.radius[number]
     couples = adjacency(motion.centre, table.half_extent[number])
     away = motion.centre[:, None, :, :2] - motion.centre[:, :, None, :2]
@@ -177,15 +177,15 @@ def _candidate_pairs(table: ShapeTable, number: Int[Tensor, "B N"], motion: Moti
 def _extent(
     table: ShapeTable, number: Tensor, motion: Motion, rows: Sequence[Tensor], direction: Float[Tensor, "R 2"]
 ) -> Float[Tensor, "R"]:
-    """How far some objects reach horizontally from their centres of mass in one direction each [m]."""
+    """Return how far some objects reach horizontally from their centres of mass in one direction each [m]."""
     length = direction.norm(dim=1, keepdim=True)
     unit = torch.where(length > 1e-6, direction / length.clamp(min=1e-6), direction.new_tensor([1.0, 0.0]))
-    directions = torch.nn.functional.pad(unit, (0, 1))[:, None]
+    directions = functional.pad(unit, (0, 1))[:, None]
     return table.extents(number[tuple(rows)], rotations.matrix(motion.quaternion[tuple(rows)]), directions)[:, 0]
 
 
 def _connected(seed: Bool[Tensor, "B N"], links: Bool[Tensor, "B N N"]) -> Bool[Tensor, "B N"]:
-    """Everything connected to a seed by any number of links."""
+    """Return everything connected to a seed by any number of links."""
     for _ in range(seed.shape[1] - 1):
         seed = seed | (links & seed[:, None]).any(dim=2)
     return seed
@@ -194,21 +194,14 @@ def _connected(seed: Bool[Tensor, "B N"], links: Bool[Tensor, "B N N"]) -> Bool[
 def _gather(
     table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, sweep: Sweep, chosen: Bool[Tensor, "B N"]
 ) -> tuple[Graph, Solids]:
-    """The chosen objects side by side, without pairs yet, and their convex parts."""
+    """Return the chosen objects side by side, without pairs yet, and their convex parts."""
     scene, slot = chosen.nonzero().unbind(1)
     frame = rotations.facing(sweep.heading[scene])
     rotation = frame @ rotations.matrix(motion.quaternion[scene, slot])
-    origin = torch.nn.functional.pad(motion.pusher[scene], (0, 1))
-    vectors = torch.stack(
-        [
-            motion.centre[scene, slot] - origin,
-            motion.linear[scene, slot],
-            motion.angular[scene, slot],
-            torch.nn.functional.pad(sweep.shift[scene], (0, 1)),
-        ],
-        dim=2,
-    )
-    centre, linear, angular, shift = (frame @ vectors).unbind(2)
+    origin = functional.pad(motion.pusher[scene], (0, 1))
+    position, linear, angular = (part[scene, slot] for part in (motion.centre, motion.linear, motion.angular))
+    vectors = [position - origin, linear, angular, functional.pad(sweep.shift[scene], (0, 1))]
+    centre, linear, angular, shift = (frame @ torch.stack(vectors, dim=2)).unbind(2)
     which = number[scene, slot]
     outline = outlines(table, which, rotation, centre)
     parts = solids(table, which, rotation, centre, outline)
@@ -226,7 +219,7 @@ _Tensors = TypeVar("_Tensors")
 
 
 def _select_rows(values: _Tensors, rows: Tensor) -> _Tensors:
-    """Some rows of a tensor, or of every tensor in a named tuple."""
+    """Return some rows of a tensor, or of every tensor in a named tuple."""
     if isinstance(values, Tensor):
         return values[rows]  # pyright: ignore[reportReturnType]
     assert isinstance(values, tuple)
@@ -234,21 +227,15 @@ def _select_rows(values: _Tensors, rows: Tensor) -> _Tensors:
 
 
 def _keep(graph: Graph, first: Tensor, second: Tensor, contact: PairContact, kept: Bool[Tensor, "A"]) -> Graph:
-    """The objects kept, and the pairs among them in both orders."""
+    """Return the objects kept, and the pairs among them in both orders."""
     renumbered = kept.long().cumsum(0) - 1
     both = kept[first] & kept[second]
     first, second = renumbered[first[both]], renumbered[second[both]]
     gap, first_face, second_face = _select_rows(contact, both)
     opposite = gap.point + gap.distance[:, None] * gap.normal
-    pair = PairContact(
-        Gap(
-            torch.cat([gap.distance, gap.distance]),
-            torch.cat([gap.normal, -gap.normal]),
-            torch.cat([gap.point, opposite]),
-        ),
-        torch.cat([first_face, second_face]),
-        torch.cat([second_face, first_face]),
-    )
+    twice = ((gap.distance, gap.distance), (gap.normal, -gap.normal), (gap.point, opposite))
+    faces = ((first_face, second_face), (second_face, first_face))
+    pair = PairContact(Gap(*map(torch.cat, twice)), *map(torch.cat, faces))
     objects = [_select_rows(part, kept) for part in graph[:-3]]
     return Graph._make([*objects, torch.cat([first, second]), torch.cat([second, first]), pair])
 
@@ -256,11 +243,11 @@ def _keep(graph: Graph, first: Tensor, second: Tensor, contact: PairContact, kep
 # What the network sees of a graph: numbers along each object's own direction of push, from its centre of mass.
 #
 # Every object has a frame of its own: x points along the normal of the contact that pushes it most directly, z up.
-# All vectors that reach an object are told in its frame and so is its answer, so a scene that is turned or shifted
-# gives the same numbers.
+# All vectors that reach an object are in its frame and so is its answer, so a scene that is turned or shifted gives
+# the same numbers.
 
 
-AROUND = 16  # horizontal directions in which an object's extent is told
+AROUND = 16  # horizontal directions in which an object's extent is a feature
 SLANTED = 8  # directions 45 deg below and above the horizon
 FOOT = 8  # directions close to straight down, in which lies what an object stands on
 FOOT_ANGLE = math.radians(12)  # off the vertical
@@ -295,7 +282,7 @@ class Inputs(NamedTuple):
 
 
 def inputs(table: ShapeTable, graph: Graph) -> Inputs:
-    """All that the network needs."""
+    """Return the numbers that the network sees of a graph."""
     turn = rotations.facing(_directions(graph))
     quasistatic = _quasistatic_sliding(graph, graph.pusher.after, turn)
     pushed = graph.touched.nonzero()[:, 0]
@@ -305,13 +292,13 @@ def inputs(table: ShapeTable, graph: Graph) -> Inputs:
 
 
 def corrections(features: Inputs) -> Float[Tensor, "A 6"]:
-    """What the network's answer is added to: the sliding that is guessed, as displacement and rotation vector."""
+    """Return the quasi-static sliding that the network corrects, as displacement and rotation vector."""
     flat = torch.zeros_like(features.quasistatic)
     return torch.cat([features.quasistatic[:, :2], flat, features.quasistatic[:, 2:]], dim=1)
 
 
 def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
-    """Where each object is being pushed to: by the pusher, else by the closest object, else where it is moving."""
+    """Return where each object is pushed to: by the pusher, else by the closest object, else where it is moving."""
     flat = graph.linear[:, :2]
     speed = flat.norm(dim=1, keepdim=True)
     moving = torch.where(speed > 1e-6, flat / speed.clamp(min=1e-6), flat.new_tensor([1.0, 0.0]))
@@ -324,18 +311,17 @@ def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
 
 
 def _quasistatic_sliding(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -> Float[Tensor, "A 3"]:
-    """Sliding at a contact, so far that the pusher's last position is free."""
+    """Return the sliding at a contact, so far that the pusher's last position is free."""
     centre = graph.centre[:, :2]
     depth = (-graph.pusher.after.distance).clamp(min=0)
-    way = push_motion(
-        gap.point - centre, -gap.normal, depth, graph.shift, friction_arm(graph.outline - centre[:, None])
-    )
+    point, inward, arm = gap.point - centre, -gap.normal, friction_arm(graph.outline - centre[:, None])
+    way = push_motion(point, inward, depth, graph.shift, arm)
     along = (turn[:, :2, :2] @ way[:, :2, None])[..., 0]
     return torch.cat([along / SHIFT_M, way[:, 2:] / TURN_RAD], dim=1)
 
 
 def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, quasistatic: Tensor) -> Float[Tensor, "A F"]:
-    """Extents in 34 directions, height over the table, motion, the pusher's motion, how it would slide, its foot."""
+    """Return extents in 34 directions, height over the table, motion, the pusher's motion, sliding and foot."""
     slanted = functional.pad(_fan_of(SLANTED, turn), (0, 1))
     vertical = slanted.new_tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     half = math.sqrt(0.5)
@@ -351,7 +337,7 @@ def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, quasistatic: Tensor) -
 
 
 def _foot(table: ShapeTable, graph: Graph, turn: Tensor) -> Float[Tensor, "A 25"]:
-    """What an object stands on, for friction acts there: its lowest points all around, and their mean distance."""
+    """Return the lowest points all around, on which friction acts, and their mean distance from the centre."""
     fan = math.sin(FOOT_ANGLE) * _fan_of(FOOT, turn)
     downward = functional.pad(fan, (0, 1), value=-math.cos(FOOT_ANGLE))
     points = table.farthest(graph.number, turn @ graph.rotation, downward)
@@ -423,20 +409,12 @@ def _edge(
     solid = turn @ torch.stack([away / LENGTH_M, motion[0] / SHIFT_M, motion[1] / TURN_RAD], dim=2)
     flat = turn[:, :2, :2] @ torch.stack([*(p / LENGTH_M for p in points), *directions], dim=2)
     near = (gap / GAP_M).clamp(-4, 4)
-    kind = torch.full_like(gap[:, :1], is_pusher)
-    parts = [
-        kind,
-        near,
-        gap[:, 2:] / LENGTH_M,
-        slide,
-        solid.transpose(1, 2).flatten(1),
-        flat.transpose(1, 2).flatten(1),
-    ]
-    return torch.cat(parts, dim=1)
+    scalars = [torch.full_like(gap[:, :1], is_pusher), near, gap[:, 2:] / LENGTH_M, slide]
+    return torch.cat([*scalars, *(vectors.transpose(1, 2).flatten(1) for vectors in (solid, flat))], dim=1)
 
 
 def mirrored(values: Tensor, flags: Tensor, kind: Literal["node", "edge", "motion"]) -> Tensor:
-    """Features or answers with some rows reflected along their x axis: left becomes right.
+    """Return features or answers with some rows reflected along their x axis: left becomes right.
 
     Args:
         values: one row for each object or edge.
@@ -449,7 +427,7 @@ def mirrored(values: Tensor, flags: Tensor, kind: Literal["node", "edge", "motio
 
 
 def _mirror(*parts: tuple[list[int], list[float]]) -> tuple[list[int], list[float]]:
-    """Where each number comes from in the mirror, and with which sign, from those of its parts."""
+    """Return where each number comes from in the mirror and with which sign, from those of its parts."""
     order: list[int] = []
     sign: list[float] = []
     for places, signs in parts:
@@ -520,7 +498,7 @@ class PropagationNetwork(nn.Module):
         receiver: Int[Tensor, "E"],
         sender: Int[Tensor, "S"],
     ) -> Float[Tensor, "A 6"]:
-        """The motion of each node.
+        """Return the motion of each node.
 
         Args:
             nodes: features of the objects.
@@ -541,7 +519,7 @@ class PropagationNetwork(nn.Module):
 
 
 def _two_layers(inputs: int, hidden: int) -> nn.Sequential:
-    """Normalised at the end: without it, training needs about twice as long for the same error."""
+    """Return two layers and a norm, without which training needs about twice as long for the same error."""
     return nn.Sequential(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.LayerNorm(hidden))
 
 
@@ -553,9 +531,14 @@ _MOST_HIDDEN, _MOST_STEPS = 1024, 16
 
 
 def network_bytes(network: PropagationNetwork) -> bytes:
-    """A network as the contents of a file."""
+    """Return a network as the contents of a file."""
+    return parameter_bytes(network, {"format": FORMAT, "hidden": str(network.hidden), "steps": str(network.steps)})
+
+
+def parameter_bytes(network: nn.Module, metadata: Mapping[str, str]) -> bytes:
+    """Return the contents of a file with the parameters of a network in half precision."""
     tensors = {name: value.detach().cpu().half().contiguous() for name, value in network.state_dict().items()}
-    return save(tensors, {"format": FORMAT, "hidden": str(network.hidden), "steps": str(network.steps)})
+    return save(tensors, dict(metadata))
 
 
 def write_network(path: Path, network: PropagationNetwork) -> None:
@@ -580,7 +563,7 @@ def read_network(path: Path) -> PropagationNetwork:
 
 
 def described_sizes(metadata: Mapping[str, str], path: Path) -> tuple[int, int]:
-    """Width and propagation steps that a file describes.
+    """Return the width and propagation steps that a file describes.
 
     Raises:
         CorruptFile: if they are missing or out of range.
@@ -595,12 +578,12 @@ def described_sizes(metadata: Mapping[str, str], path: Path) -> tuple[int, int]:
 
 
 def shipped(name: str = "pushes") -> Path:
-    """The file of a network that comes with the package."""
+    """Return the file of a network that comes with the package."""
     return Path(str(files("osfcore.dynamics") / "shipped" / f"{name}.safetensors"))
 
 
 def read_metrics(path: Path) -> Mapping[str, Any]:
-    """What is known of how a network was trained, from the JSON beside its file; empty if that cannot be read."""
+    """Return how a network was trained, from the JSON beside its file; empty if that cannot be read."""
     try:
         content = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -619,7 +602,7 @@ def advance(
     sweep: Sweep,
     mirror: Bool[Tensor, "B"] | None = None,
 ) -> Motion:
-    """The scenes one substep later.
+    """Return the scenes one substep later.
 
     Args:
         network: predicts the motion of what can move.
@@ -629,11 +612,9 @@ def advance(
         sweep: what the pusher does.
         mirror: scenes to reflect along the heading, in training.
     """
-    pusher = motion.pusher + sweep.shift
     graph = build_graph(table, number, motion, sweep)
-    rest = motion._replace(
-        linear=torch.zeros_like(motion.linear), angular=torch.zeros_like(motion.angular), pusher=pusher
-    )
+    still = torch.zeros_like(motion.linear)
+    rest = motion._replace(linear=still, angular=still, pusher=motion.pusher + sweep.shift)
     if not len(graph.scene):
         return rest
     features = inputs(table, graph)
@@ -642,28 +623,21 @@ def advance(
     linear, angular = linear * awake[:, None], angular * awake[:, None]
     place = (graph.scene, graph.slot)
     quaternion = motion.quaternion[place]
-    quaternion = torch.where(
-        awake[:, None], rotations.unit(rotations.multiply(rotations.exponential(angular), quaternion)), quaternion
-    )
+    turned = rotations.unit(rotations.multiply(rotations.exponential(angular), quaternion))
+    quaternion = torch.where(awake[:, None], turned, quaternion)
     centre = motion.centre[place] + linear
     sunk = motion.floor[place] - lowest_point(table, graph.number, centre, quaternion)
     lift = sunk.clamp(min=0) * awake
-    linear = linear + torch.nn.functional.pad(lift[:, None], (2, 0))
+    linear = linear + functional.pad(lift[:, None], (2, 0))
     centre = motion.centre[place] + linear
-    return Motion(
-        centre=motion.centre.index_put(place, centre),
-        quaternion=motion.quaternion.index_put(place, quaternion),
-        linear=rest.linear.index_put(place, linear),
-        angular=rest.angular.index_put(place, angular),
-        pusher=pusher,
-        floor=motion.floor,
-    )
+    moved = (part.index_put(place, new) for part, new in zip(rest, (centre, quaternion, linear, angular), strict=False))
+    return Motion(*moved, pusher=rest.pusher, floor=rest.floor)
 
 
 def _predict_motion(
     network: PropagationNetwork, features: Inputs, mirror: Bool[Tensor, "M"] | None
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """Translations [m] and rotation vectors [rad] in the world that the network predicts for M objects.
+    """Return translations [m] and rotation vectors [rad] in the world that the network predicts for M objects.
 
     The network's output is a residual over the quasi-static correction, in units of typical motions, in each object's
     own frame along the heading; with `mirror`, it sees reflected features and its output is reflected back.
@@ -688,7 +662,7 @@ def unroll(
     velocity: Float[Tensor, "T B 2"],
     mirror: Bool[Tensor, "B"] | None = None,
 ) -> Iterator[Motion]:
-    """The scenes after each substep of T actions.
+    """Yield the scenes after each substep of T actions.
 
     Args:
         network: predicts the motion of what can move.

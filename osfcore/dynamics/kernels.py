@@ -8,6 +8,7 @@ The same numbers as `graph.py` in PyTorch, which training needs for its gradient
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from typing import Any, NamedTuple
 
 import numba
@@ -89,7 +90,7 @@ class Weights(NamedTuple):
     steps: int
 
 
-class Memory(NamedTuple):
+class Memory(namedtuple("Memory", "nodes edges receiver sender own state effect relation a b c motion")):
     """Graphs of many scenes, and what the network writes on: rows of numbers, one after another.
 
     Attributes:
@@ -101,22 +102,9 @@ class Memory(NamedTuple):
         motion: the answer, `MOTION_WIDTH` a row.
     """
 
-    nodes: np.ndarray
-    edges: np.ndarray
-    receiver: np.ndarray
-    sender: np.ndarray
-    own: np.ndarray
-    state: np.ndarray
-    effect: np.ndarray
-    relation: np.ndarray
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    motion: np.ndarray
-
 
 def packed_weights(network: PropagationNetwork) -> Weights:
-    """The weights of a network."""
+    """Return the weights of a network."""
     propagators = zip(network.edge_propagators, network.node_propagators, strict=True)
     blocks = [network.node_encoder, network.edge_encoder, *(block for pair in propagators for block in pair)]
     parts: list[Tensor] = []
@@ -131,14 +119,14 @@ def packed_weights(network: PropagationNetwork) -> Weights:
 
 
 def _padded(matrix: Tensor) -> Tensor:
-    """With rows and columns of zeros up to multiples of four."""
+    """Return a matrix with rows and columns of zeros up to multiples of four."""
     rows, columns = matrix.shape
     return nn.functional.pad(matrix, (0, -columns % 4, 0, -rows % 4))
 
 
 @numba.njit(error_model="numpy")
 def new_memory(nodes, edges, hidden):
-    """Room for so many nodes and edges."""
+    """Return room for so many nodes and edges."""
     f, a, e = np.float32, (nodes + 3) // 4 * 4, (edges + 3) // 4 * 4
     most = max(a, e) * hidden
     return Memory(
@@ -150,7 +138,7 @@ def new_memory(nodes, edges, hidden):
 
 @numba.njit(**HELPER)
 def predict_motions(weights, memory, nodes, edges) -> None:
-    """The network's answer, into `memory.motion`, for the first rows of features."""
+    """Write the network's answer for the first rows of features into `memory.motion`."""
     flat, hidden, m = weights.flat, weights.hidden, memory
     at = _encode(flat, np.int64(0), m.nodes, NODE_WIDTH, nodes, hidden, m, m.own)
     at = _encode(flat, at, m.edges, EDGE_WIDTH, edges, hidden, m, m.relation)
@@ -213,7 +201,7 @@ def _propagate_nodes(flat, at, m, nodes, edges, hidden):
 
 @numba.njit(**HELPER)
 def _encode(flat, at, inputs, count, rows, hidden, m, outputs):
-    """A linear layer, SiLU, another linear layer, its norm; where the weights end."""
+    """Write a linear layer, SiLU, another linear layer and its norm to the outputs; return where the weights end."""
     for k in range(rows * hidden):
         outputs[_u(k)] = ZERO
     _set_rows(flat, at + count * hidden, rows, hidden, m.a)
@@ -223,7 +211,7 @@ def _encode(flat, at, inputs, count, rows, hidden, m, outputs):
 
 @numba.njit(**HELPER)
 def _add_second_layer(flat, at, rows, hidden, m, outputs):
-    """Add the norm of a linear layer of SiLU of `m.a`, which is lost, as is `m.b`; where the weights end."""
+    """Add the norm of a linear layer of SiLU of `m.a`, which is lost, as is `m.b`; return where the weights end."""
     size, between = hidden * hidden, m.b  # not the outputs: two names for one array would be computed one by one
     _silu(m.a, rows * hidden)
     _set_rows(flat, at + size, rows, hidden, between)
@@ -245,7 +233,7 @@ def _add_second_layer(flat, at, rows, hidden, m, outputs):
 
 @numba.njit(**HELPER)
 def _set_rows(flat, at, rows, width, outputs) -> None:
-    """All rows, rounded up to a multiple of four, become the bias."""
+    """Set all rows, rounded up to a multiple of four, to the bias."""
     bias = _u(at)
     for r in range((rows + 3) // 4 * 4):
         row = _u(r * width)
@@ -255,7 +243,7 @@ def _set_rows(flat, at, rows, width, outputs) -> None:
 
 @numba.njit(**HELPER)
 def _add_product(w, at, x, count, rows, width, out) -> None:
-    """out[r, n] += sum_k x[r, k] w[k, n] for all rows, rounded up to a multiple of four."""
+    """Add sum_k x[r, k] w[k, n] to out[r, n] for all rows, rounded up to a multiple of four."""
     size, length = _u(width), _u(count)
     for r in range((rows + 3) // 4):
         a = _u(4 * r) * length
@@ -295,7 +283,7 @@ def _silu(x, count) -> None:
 
 # Support functions of bodies, their outlines seen from above, gaps between outlines, and pushes at a contact.
 #
-# The same as `ShapeTable`, `osfcore.geometry.polygons` and `limit_surface`, for one body or pair at a time. A gap
+# The same as `ShapeTable`, `osfcore.geometry.polygons` and `motion.push_motion`, for one body or pair at a time. A gap
 # is the distance, the normal out of the first outline (x, y) and the point of it that is nearest (x, y).
 
 
@@ -308,25 +296,18 @@ _TINIER, _REPEATED = np.float32(1e-14), np.float32(1e-4)
 _LEAST_GAIN = np.float32(1e-3)
 
 
-class Shapes(NamedTuple):
+class Shapes(namedtuple("Shapes", "support first_part part_count radius half_extent")):
     """A `ShapeTable` as compiled code takes it; attributes as there."""
-
-    support: np.ndarray
-    first_part: np.ndarray
-    part_count: np.ndarray
-    radius: np.ndarray
-    half_extent: np.ndarray
 
 
 def packed_shapes(table: ShapeTable) -> Shapes:
-    """The arrays of a table."""
-    arrays = (table.support, table.first_part, table.part_count, table.radius, table.half_extent)
-    return Shapes(*(array.cpu().numpy() for array in arrays))
+    """Return the arrays of a table."""
+    return Shapes(*(getattr(table, name).cpu().numpy() for name in Shapes._fields))
 
 
 @numba.njit(**HELPER)
 def support_row(body, x, y, z):
-    """Row of `Shapes.support` for a direction in the body's frame, of any length but 0."""
+    """Return the row of `Shapes.support` for a direction in the body's frame, of any length but 0."""
     length = abs(x) + abs(y) + abs(z)
     x, y = x / length, y / length
     if z < ZERO:
@@ -338,7 +319,7 @@ def support_row(body, x, y, z):
 
 @numba.njit(**HELPER)
 def farthest_point(support, body, r, n, x, y, z):
-    """Farthest point in a direction, relative to the centre of mass; r[n] rotates from the body's frame."""
+    """Return the farthest point in a direction, relative to the centre of mass; r[n] rotates from the body's frame."""
     row = support_row(
         body,
         r[n, 0, 0] * x + r[n, 1, 0] * y + r[n, 2, 0] * z,
@@ -355,14 +336,14 @@ def farthest_point(support, body, r, n, x, y, z):
 
 @numba.njit(**HELPER)
 def extent_along(support, body, r, n, x, y, z):
-    """How far a body reaches in a direction, a unit vector."""
+    """Return how far a body reaches in a direction, a unit vector."""
     a, b, c = farthest_point(support, body, r, n, x, y, z)
     return a * x + b * y + c * z
 
 
 @numba.njit(**HELPER)
 def draw_outline(support, body, r, n, centre_x, centre_y, xs, ys, row) -> None:
-    """The outline seen from above, into xs[row] and ys[row]."""
+    """Write the outline seen from above into xs[row] and ys[row]."""
     for k in range(OUTLINE):
         x, y, _ = farthest_point(support, body, r, n, CIRCLE_X[k], CIRCLE_Y[k], ZERO)
         xs[row, k], ys[row, k] = x + centre_x, y + centre_y
@@ -370,13 +351,13 @@ def draw_outline(support, body, r, n, centre_x, centre_y, xs, ys, row) -> None:
 
 @numba.njit(**HELPER)
 def direction_number(x, y, count):
-    """Number of the nearest of `count` equally spaced directions."""
+    """Return the number of the nearest of `count` equally spaced directions."""
     return np.int64(np.rint(math.atan2(y, x) * np.float32(count / (2 * np.pi)))) % count
 
 
 @numba.njit(**HELPER)
 def outline_to_point(xs, ys, row, px, py):
-    """The gap from an outline to a point."""
+    """Return the gap from an outline to a point."""
     best, best_x, best_y, middle_x, middle_y = NEVER, ZERO, ZERO, ZERO, ZERO
     for k in range(OUTLINE):
         x, y = xs[row, k], ys[row, k]
@@ -400,7 +381,7 @@ def outline_to_point(xs, ys, row, px, py):
 
 @numba.njit(**HELPER)
 def _separation(xs, ys, a, us, vs, b):
-    """Largest separation of two outlines along the normals of the first one's sides, and that normal."""
+    """Return the largest separation of two outlines along normals of the first one's sides, and that normal."""
     best, best_x, best_y = -NEVER, ONE, ZERO
     for k in range(0, OUTLINE, PAIR_STRIDE):
         after = (k + PAIR_STRIDE) % OUTLINE
@@ -423,7 +404,7 @@ def _separation(xs, ys, a, us, vs, b):
 
 @numba.njit(**HELPER)
 def outline_to_outline(xs, ys, a, us, vs, b):
-    """The gap out of the outline xs[a], ys[a] to us[b], vs[b]: the best separating axis."""
+    """Return the gap out of the outline xs[a], ys[a] to us[b], vs[b]: the best separating axis."""
     distance, x, y = _separation(xs, ys, a, us, vs, b)
     other, other_x, other_y = _separation(us, vs, b, xs, ys, a)
     if other > distance:
@@ -434,7 +415,7 @@ def outline_to_outline(xs, ys, a, us, vs, b):
 
 @numba.njit(**HELPER)
 def push_motion(x, y, inward_x, inward_y, depth, shift_x, shift_y, arm):
-    """Displacement (x, y) and turn of an object pushed at a contact; as `limit_surface.push_motion`."""
+    """Return displacement (x, y) and turn of an object pushed at a contact; as `motion.push_motion`."""
     if depth <= ZERO:
         return ZERO, ZERO, ZERO
     drag = shift_y * inward_x - shift_x * inward_y
@@ -466,19 +447,17 @@ _PAIR = np.float32(PAIR_REACH_M + 2 * LOOKUP_M)
 _TINY, _SHORT = np.float32(1e-12), np.float32(1e-6)
 
 
-class Scenes(NamedTuple):
+class Scenes(namedtuple("Scenes", "number centre quaternion linear angular pusher floor")):
     """Scenes that are rolled out; attributes as those of `Motion`, `number` the shape of each object."""
 
-    number: np.ndarray
-    centre: np.ndarray
-    quaternion: np.ndarray
-    linear: np.ndarray
-    angular: np.ndarray
-    pusher: np.ndarray
-    floor: np.ndarray
 
-
-class Contacts(NamedTuple):
+class Contacts(
+    namedtuple(
+        "Contacts",
+        "centre linear angular rotation outline_x outline_y first many part_x part_y low high reach "
+        "before halfway after face moving near possible touched awake couples touching pair gap faces",
+    )
+):
     """One scene's N objects, along the pusher's heading with its centre as the origin.
 
     Attributes:
@@ -495,38 +474,10 @@ class Contacts(NamedTuple):
         pair, gap, faces: the pairs that touch; out of the first one; both ends of both sides.
     """
 
-    centre: np.ndarray
-    linear: np.ndarray
-    angular: np.ndarray
-    rotation: np.ndarray
-    outline_x: np.ndarray
-    outline_y: np.ndarray
-    first: np.ndarray
-    many: np.ndarray
-    part_x: np.ndarray
-    part_y: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    reach: np.ndarray
-    before: np.ndarray
-    halfway: np.ndarray
-    after: np.ndarray
-    face: np.ndarray
-    moving: np.ndarray
-    near: np.ndarray
-    possible: np.ndarray
-    touched: np.ndarray
-    awake: np.ndarray
-    couples: np.ndarray
-    touching: np.ndarray
-    pair: np.ndarray
-    gap: np.ndarray
-    faces: np.ndarray
-
 
 @numba.njit(error_model="numpy")
 def new_contacts(n, parts):
-    """Room for n objects that together have so many parts."""
+    """Return room for n objects that together have so many parts."""
     f, i, b, pairs = np.float32, np.int64, np.bool_, n * n
     return Contacts(
         np.empty((n, 3), f), np.empty((n, 3), f), np.empty((n, 3), f), np.empty((n, 3, 3), f),
@@ -570,7 +521,7 @@ def find_contacts(shapes, scenes, b, heading_x, heading_y, shift_x, shift_y, c):
 
 @numba.njit(**HELPER)
 def _any_seed(shapes, scenes, b, shift_x, shift_y, c):
-    """Which objects move, and which the pusher may touch: a cheap upper bound."""
+    """Mark which objects move, and which the pusher may touch: a cheap upper bound."""
     found = False
     px, py = scenes.pusher[b, 0], scenes.pusher[b, 1]
     square = shift_x * shift_x + shift_y * shift_y + _TINY
@@ -594,7 +545,7 @@ def _any_seed(shapes, scenes, b, shift_x, shift_y, c):
 
 @numba.njit(**HELPER)
 def _reach_of(shapes, body, c, n, x, y, length):
-    """How far an object reaches horizontally from its centre of mass."""
+    """Return how far an object reaches horizontally from its centre of mass."""
     if length <= _SHORT:
         x, y, length = ONE, ZERO, ONE
     return extent_along(shapes.support, body, c.rotation, n, x / length, y / length, ZERO)
@@ -602,14 +553,11 @@ def _reach_of(shapes, body, c, n, x, y, length):
 
 @numba.njit(**HELPER)
 def rotation_of(quaternion, b, n, rotation) -> None:
-    """The rotation matrix of object n in scene b, into rotation[n]."""
+    """Write the rotation matrix of object n in scene b into rotation[n]."""
     w, x, y, z = quaternion[b, n, 0], quaternion[b, n, 1], quaternion[b, n, 2], quaternion[b, n, 3]
     r = rotation
-    r[n, 0, 0], r[n, 1, 1], r[n, 2, 2] = (
-        ONE - TWO * (y * y + z * z),
-        ONE - TWO * (x * x + z * z),
-        ONE - TWO * (x * x + y * y),
-    )
+    r[n, 0, 0], r[n, 1, 1] = ONE - TWO * (y * y + z * z), ONE - TWO * (x * x + z * z)
+    r[n, 2, 2] = ONE - TWO * (x * x + y * y)
     r[n, 0, 1], r[n, 1, 0] = TWO * (x * y - w * z), TWO * (x * y + w * z)
     r[n, 0, 2], r[n, 2, 0] = TWO * (x * z + w * y), TWO * (x * z - w * y)
     r[n, 1, 2], r[n, 2, 1] = TWO * (y * z - w * x), TWO * (y * z + w * x)
@@ -617,7 +565,7 @@ def rotation_of(quaternion, b, n, rotation) -> None:
 
 @numba.njit(**HELPER)
 def _couple(shapes, scenes, b, c) -> None:
-    """Pairs that could collide (eq. 8) and are not clear of each other along the line between their centres."""
+    """Mark pairs that could collide (eq. 8) and are not clear of each other along the line between their centres."""
     count, centre, number = len(scenes.number), scenes.centre, scenes.number
     for n in range(count):
         rotation_of(scenes.quaternion, b, n, c.rotation)
@@ -637,7 +585,7 @@ def _couple(shapes, scenes, b, c) -> None:
 
 @numba.njit(**HELPER)
 def _spread(links, chosen) -> None:
-    """Everything connected to what is chosen by any number of links."""
+    """Choose everything connected to what is chosen by any number of links."""
     changed = True
     while changed:
         changed = False
@@ -649,7 +597,7 @@ def _spread(links, chosen) -> None:
 
 @numba.njit(**HELPER)
 def _place(shapes, scenes, b, n, heading_x, heading_y, c) -> None:
-    """An object along the heading, and its outline."""
+    """Write an object along the heading, and its outline."""
     dx, dy = scenes.centre[b, n, 0] - scenes.pusher[b, 0], scenes.centre[b, n, 1] - scenes.pusher[b, 1]
     c.centre[n, 0], c.centre[n, 1] = heading_x * dx + heading_y * dy, heading_x * dy - heading_y * dx
     c.centre[n, 2] = scenes.centre[b, n, 2]
@@ -666,7 +614,7 @@ def _place(shapes, scenes, b, n, heading_x, heading_y, c) -> None:
 
 @numba.njit(**HELPER)
 def _find_parts(shapes, number, n, used, c):
-    """The convex parts of an object, from number `used` on; where the next ones go."""
+    """Write the convex parts of an object from number `used` on; return where the next ones go."""
     first, many = shapes.first_part[number], shapes.part_count[number]
     c.first[n], c.many[n] = used, many
     for part in range(many):
@@ -685,7 +633,7 @@ def _find_parts(shapes, number, n, used, c):
 
 @numba.njit(**HELPER)
 def _meet_pusher(n, shift_x, shift_y, c) -> None:
-    """The gaps between the pusher's rim and the nearest part of an object."""
+    """Write the gaps between the pusher's rim and the nearest part of an object."""
     c.before[n, 0], c.halfway[n, 0], c.after[n, 0] = NEVER, NEVER, NEVER
     if not c.near[n]:
         return
@@ -720,7 +668,7 @@ def _put_gap(gaps, row, distance, x, y, u, v) -> None:
 
 @numba.njit(**HELPER)
 def _put_face(xs, ys, row, x, y, faces, at, column) -> None:
-    """Both ends of the side of an outline that faces a direction."""
+    """Write both ends of the side of an outline that faces a direction."""
     middle = direction_number(x, y, OUTLINE)
     for end, step in ((0, -1), (2, 1)):
         corner = (middle + step) % OUTLINE
@@ -729,7 +677,7 @@ def _put_face(xs, ys, row, x, y, faces, at, column) -> None:
 
 @numba.njit(**HELPER)
 def _find_pairs(count, c):
-    """Pairs of objects that can touch within a substep; how many."""
+    """Write the pairs of objects that can touch within a substep; return how many there are."""
     pairs = 0
     for i in range(count):
         for j in range(count):
@@ -754,7 +702,7 @@ def _find_pairs(count, c):
 
 @numba.njit(**HELPER)
 def _nearest_parts(i, j, c):
-    """Among all parts of two objects the two that are nearest, and their gap; far ones are ruled out by a bound."""
+    """Return the nearest two of all parts of two objects, and their gap; a bound rules out far ones."""
     least = NEVER
     for p in range(c.first[i], c.first[i] + c.many[i]):
         for q in range(c.first[j], c.first[j] + c.many[j]):
@@ -773,7 +721,7 @@ def _nearest_parts(i, j, c):
 
 @numba.njit(**HELPER)
 def _separation_bound(p, q, c):
-    """A bound of the distance of two parts, a few millimetres less at most; far where one is well above the other."""
+    """Return a bound of the distance of two parts, a few millimetres less at most; far where one is well above."""
     if max(c.low[p] - c.high[q], c.low[q] - c.high[p]) > _CLEAR:
         return _FAR
     least = NEVER
@@ -804,7 +752,7 @@ _GAPS_AT = 1  # in the row of an edge
 
 @numba.njit(**HELPER)
 def add_features(shapes, scenes, contacts, pairs, shift_x, shift_y, scratch, memory, nodes, edges):
-    """Rows for the objects of a scene that take part, and for what touches them.
+    """Write rows for the objects of a scene that take part, and for what touches them.
 
     Args:
         pairs: how many of `contacts.pair` count.
@@ -841,7 +789,7 @@ def add_features(shapes, scenes, contacts, pairs, shift_x, shift_y, scratch, mem
 
 @numba.njit(**HELPER)
 def _choose_frame(n, pairs, c, scratch) -> None:
-    """The frame of an object, whose x axis points where it is being pushed to, and c of the limit surface."""
+    """Write the frame of an object, whose x axis points where it is pushed to, and c of the limit surface."""
     x, y = c.linear[n, 0], c.linear[n, 1]
     speed = np.sqrt(x * x + y * y)
     x, y = (x / speed, y / speed) if speed > _RESTS else (ONE, ZERO)
@@ -864,7 +812,7 @@ def _choose_frame(n, pairs, c, scratch) -> None:
 
 @numba.njit(**HELPER)
 def _sliding(n, gaps, c, shift_x, shift_y, scratch):
-    """Sliding at a contact, so far that the pusher's last position is free; in units of the answer."""
+    """Return the sliding at a contact, so far that the pusher's last position is free; in units of the answer."""
     if not c.touched[n]:
         return ZERO, ZERO, ZERO
     depth = max(-c.after[n, 0], ZERO)
@@ -876,7 +824,7 @@ def _sliding(n, gaps, c, shift_x, shift_y, scratch):
 
 @numba.njit(**HELPER)
 def _turned(scratch, n, x, y):
-    """A horizontal vector in an object's frame."""
+    """Return a horizontal vector in an object's frame."""
     return scratch[n, 0] * x + scratch[n, 1] * y, scratch[n, 0] * y - scratch[n, 1] * x
 
 
@@ -888,7 +836,7 @@ def _put(rows, at, x, y):
 
 @numba.njit(**HELPER)
 def _put_vector(rows, at, scratch, n, x, y, z, scale):
-    """A vector in an object's frame; where the next number goes."""
+    """Write a vector in an object's frame; return where the next number goes."""
     x, y = _turned(scratch, n, x, y)
     rows[at], rows[at + 1], rows[at + 2] = scale * x, scale * y, scale * z
     return at + 3
@@ -922,7 +870,7 @@ def _add_node(shapes, body, n, c, shift_x, shift_y, scratch, rows, at) -> None:
 
 @numba.njit(**HELPER)
 def _from_frame(scratch, n, x, y):
-    """The inverse of `_turned`."""
+    """Return a vector of an object's frame along the heading: the inverse of `_turned`."""
     return scratch[n, 0] * x - scratch[n, 1] * y, scratch[n, 1] * x + scratch[n, 0] * y
 
 
@@ -936,7 +884,7 @@ def _put_gaps(rows, at, kind, before, halfway, after):
 
 @numba.njit(**HELPER)
 def _put_point(rows, at, scratch, n, c, x, y):
-    """A point from an object's centre of mass, in its frame; where the next number goes."""
+    """Write a point from an object's centre of mass, in its frame; return where the next number goes."""
     x, y = _turned(scratch, n, x - c.centre[n, 0], y - c.centre[n, 1])
     return _put(rows, at, x * _PER_LENGTH, y * _PER_LENGTH)
 
@@ -968,7 +916,7 @@ def _add_pusher(n, c, shift_x, shift_y, scratch, rows, at) -> None:
 
 @numba.njit(**HELPER)
 def _add_neighbour(k, is_first, c, scratch, rows, at) -> None:
-    """The edge to one object of pair k from the other one."""
+    """Write the edge to one object of pair k from the other one."""
     i, j = (c.pair[k, 0], c.pair[k, 1]) if is_first else (c.pair[k, 1], c.pair[k, 0])
     distance, x, y, px, py = c.gap[k, 0], c.gap[k, 1], c.gap[k, 2], c.gap[k, 3], c.gap[k, 4]
     own, other = (0, 4) if is_first else (4, 0)
@@ -978,12 +926,8 @@ def _add_neighbour(k, is_first, c, scratch, rows, at) -> None:
     later = distance + dx * x + dy * y
     at = _put_gaps(rows, at, ZERO, distance, HALF * (distance + later), later)
     rows[at], rows[at + 1], rows[at + 2] = ZERO, ZERO, ZERO
-    away_x, away_y, away_z = (
-        c.centre[j, 0] - c.centre[i, 0],
-        c.centre[j, 1] - c.centre[i, 1],
-        c.centre[j, 2] - c.centre[i, 2],
-    )
-    at = _put_vector(rows, at + 3, scratch, i, away_x, away_y, away_z, _PER_LENGTH)
+    away_x, away_y = c.centre[j, 0] - c.centre[i, 0], c.centre[j, 1] - c.centre[i, 1]
+    at = _put_vector(rows, at + 3, scratch, i, away_x, away_y, c.centre[j, 2] - c.centre[i, 2], _PER_LENGTH)
     at = _put_vector(rows, at, scratch, i, c.linear[j, 0], c.linear[j, 1], c.linear[j, 2], _PER_SHIFT)
     at = _put_vector(rows, at, scratch, i, c.angular[j, 0], c.angular[j, 1], c.angular[j, 2], _PER_TURN)
     at = _put_point(rows, at, scratch, i, c, px, py)
@@ -1053,32 +997,29 @@ def unroll_block(
                 _move(shapes, scenes, places[node, 0], places[node, 1], frames, node, memory.motion, moved,
                       contacts.rotation)  # fmt: skip
         if (step + 1) % SUBSTEPS == 0:
-            _record(scenes, moved, first, step // SUBSTEPS, centre, quaternion, has_moved)
+            centre[first:last, step // SUBSTEPS] = scenes.centre
+            quaternion[first:last, step // SUBSTEPS] = scenes.quaternion
+            has_moved[first:last, step // SUBSTEPS] = moved
 
 
 @numba.njit(error_model="numpy")
 def _new_scenes(number, start, begins, first, size):
-    """A block of scenes, all of them in the same state."""
+    """Return a block of scenes, all of them in the same state."""
     centre, quaternion, linear, angular, floor = start
     n = len(number)
     scenes = Scenes(
         number, np.empty((size, n, 3), np.float32), np.empty((size, n, 4), np.float32),
         np.empty((size, n, 3), np.float32), np.empty((size, n, 3), np.float32), np.empty((size, 2), np.float32), floor,
     )  # fmt: skip
-    for b in range(size):
-        for k in range(n):
-            for i in range(3):
-                scenes.centre[b, k, i], scenes.linear[b, k, i] = centre[k, i], linear[k, i]
-                scenes.angular[b, k, i] = angular[k, i]
-            for i in range(4):
-                scenes.quaternion[b, k, i] = quaternion[k, i]
-        scenes.pusher[b, 0], scenes.pusher[b, 1] = begins[first + b, 0], begins[first + b, 1]
+    scenes.centre[:], scenes.quaternion[:] = centre, quaternion
+    scenes.linear[:], scenes.angular[:] = linear, angular
+    scenes.pusher[:] = begins[first : first + size]
     return scenes
 
 
 @numba.njit(**HELPER)
 def _heading(scenes, b, x, y):
-    """The direction of the pusher's velocity or, where it stands still, of the fastest object; as `motion.headings`."""
+    """Return the direction of the velocity of the pusher or, if it stands still, of the fastest object."""
     speed = np.sqrt(x * x + y * y)
     if speed > _STANDS:
         return x / speed, y / speed
@@ -1093,7 +1034,7 @@ def _heading(scenes, b, x, y):
 
 @numba.njit(**HELPER)
 def _stop(scenes, b, contacts, scratch, x, y, places, frames, node) -> None:
-    """Everything in a scene at rest, and what is needed to move the objects that take part afterwards.
+    """Put a scene at rest, and keep what is needed to move the objects that take part afterwards.
 
     Args:
         x, y: the heading.
@@ -1113,13 +1054,10 @@ def _stop(scenes, b, contacts, scratch, x, y, places, frames, node) -> None:
 
 @numba.njit(**HELPER)
 def _move(shapes, scenes, b, n, frames, node, motion, moved, rotation) -> None:
-    """An object as the network and the sliding that it corrects tell; asleep if that is next to nothing."""
+    """Move an object by the network's answer and the sliding that it corrects; it rests if that is next to nothing."""
     at, x, y = node * MOTION_WIDTH, frames[node, 0], frames[node, 1]
-    u, v, dz = (
-        _SHIFT * (motion[at] + frames[node, 2]),
-        _SHIFT * (motion[at + 1] + frames[node, 3]),
-        _SHIFT * motion[at + 2],
-    )
+    u, v = _SHIFT * (motion[at] + frames[node, 2]), _SHIFT * (motion[at + 1] + frames[node, 3])
+    dz = _SHIFT * motion[at + 2]
     dx, dy = x * u - y * v, y * u + x * v
     u, v, wz = _TURN * motion[at + 3], _TURN * motion[at + 4], _TURN * (motion[at + 5] + frames[node, 4])
     wx, wy = x * u - y * v, y * u + x * v
@@ -1153,21 +1091,10 @@ def _turn(quaternion, b, n, x, y, z, angle) -> None:
 
 @numba.njit(**HELPER)
 def _lowest(shapes, scenes, b, n, height, rotation):
-    """Height of the lowest point of an object whose centre is at a height; as `motion.lowest_point`."""
+    """Return the height of the lowest point of an object whose centre is at a height; as `motion.lowest_point`."""
     rotation_of(scenes.quaternion, b, n, rotation)
     least = ZERO
     for k in range(len(_DOWN_X)):
         _, _, z = farthest_point(shapes.support, scenes.number[n], rotation, n, _DOWN_X[k], _DOWN_Y[k], -ONE)
         least = min(least, z)
     return height + least
-
-
-@numba.njit(**HELPER)
-def _record(scenes, moved, first, action, centre, quaternion, has_moved) -> None:
-    for b in range(len(moved)):
-        for n in range(moved.shape[1]):
-            has_moved[first + b, action, n] = moved[b, n]
-            for k in range(3):
-                centre[first + b, action, n, k] = scenes.centre[b, n, k]
-            for k in range(4):
-                quaternion[first + b, action, n, k] = scenes.quaternion[b, n, k]

@@ -38,7 +38,7 @@ ARM_RATIO = 1.2  # c over the mean radius of the outline: objects stand on their
 
 
 def friction_arm(outline: Float[Tensor, "*batch K 2"]) -> Float[Tensor, "*batch"]:
-    """c: moment over force that friction with the table can hold, from outlines around their centres of mass [m]."""
+    """Return c, the moment over force that friction with the table can hold, from outlines around their centres [m]."""
     return ARM_RATIO * outline.norm(dim=-1).mean(dim=-1)
 
 
@@ -49,7 +49,7 @@ def push_motion(
     shift: Float[Tensor, "B 2"],
     arm: Float[Tensor, "B"],
 ) -> Float[Tensor, "B 3"]:
-    """Motion of an object pushed at a contact: displacement (x, y) [m] and rotation about the vertical [rad].
+    """Return the motion of an object pushed at a contact: displacement (x, y) [m] and turn about the vertical [rad].
 
     Args:
         point: of contact, from the centre of friction [m].
@@ -89,7 +89,7 @@ SUBSTEPS = 4  # of one action: the pusher travels 6 cm in one, too far to see co
 def pusher_path(
     start: Float[np.ndarray, "*#batch 2"], velocity: Float[np.ndarray, "*batch T 2"]
 ) -> Float[np.ndarray, "*batch S1 2"]:
-    """Where the pusher's centre is before the first and after each substep [m]; it stops where its reach ends."""
+    """Return the pusher's centre before the first and after each substep [m]; it stops where its reach ends."""
     place = np.broadcast_to(np.asarray(start, float), (*velocity.shape[:-2], 2))
     reach = np.maximum(PUSHER_REACH_M, np.abs(place))
     path = [place]
@@ -110,7 +110,11 @@ _EDGE_M = TABLE_SIDE_M / 2 - 0.05  # what comes nearer to the table's edge may f
 
 
 def substates(episode: PushEpisode) -> Pose:
-    """All poses of an episode, substep by substep."""
+    """Return all poses of an episode, substep by substep.
+
+    Raises:
+        InvalidInput: if it was recorded without them.
+    """
     if episode.sub_positions is None or episode.sub_quaternions is None or episode.sub_positions.shape[1] != SUBSTEPS:
         raise InvalidInput("push file", "without poses within its actions", "one that 'osf collect pushes' wrote")
     positions = np.concatenate([episode.positions[:1], episode.sub_positions.reshape(-1, *episode.positions.shape[1:])])
@@ -119,7 +123,7 @@ def substates(episode: PushEpisode) -> Pose:
 
 
 def is_on_table(episode: PushEpisode) -> Bool[np.ndarray, "T1"]:
-    """Whether all objects are on the table, away from its edge, before the first and after each action."""
+    """Return whether all objects are on the table, away from its edge, before the first and after each action."""
     reach = np.abs(episode.positions[..., :2]).max(axis=(1, 2))
     return (reach < _EDGE_M) & (episode.positions[..., 2].min(axis=1) > -_SUNK_M)
 
@@ -166,7 +170,7 @@ class Sweep(NamedTuple):
 def lowest_point(
     table: ShapeTable, number: Int[Tensor, "A"], centre: Float[Tensor, "A 3"], quaternion: Float[Tensor, "A 4"]
 ) -> Float[Tensor, "A"]:
-    """Height of the lowest point of each object over the table's top [m].
+    """Return the height of the lowest point of each object over the table's top [m].
 
     The lowest of what is farthest straight down and in directions around it: one alone may find the wrong end of a face
     that hardly tilts.
@@ -183,9 +187,9 @@ def lowest_point(
 
 
 def headings(velocity: Float[Tensor, "B 2"], motion: Motion) -> Float[Tensor, "B 2"]:
-    """Directions of the pusher's velocities; where it stands still, of the fastest object, so that nothing else counts.
+    """Return the directions of the pusher's velocities; where it stands still, of the fastest object.
 
-    Everything the network sees is turned into this direction: turning the scene turns the prediction.
+    Everything the network sees is turned into this direction, so that turning the scene turns the prediction.
     """
     speed = velocity.norm(dim=1, keepdim=True)
     fastest = motion.linear[..., :2].norm(dim=2).argmax(dim=1)
@@ -197,7 +201,7 @@ def headings(velocity: Float[Tensor, "B 2"], motion: Motion) -> Float[Tensor, "B
 
 
 def going_on(former: Motion, motion: Motion) -> Motion:
-    """The scenes with velocities by how things moved since the former ones, one action ago.
+    """Return the scenes with velocities by how things moved since the former ones, one action ago.
 
     The mean over the action stands for its last substep. (To predict that action again and take its last substep is
     less exact, see docs/dynamics.md.) What moved by less than an estimate may err is at rest.
@@ -210,6 +214,6 @@ def going_on(former: Motion, motion: Motion) -> Motion:
 
 
 def sleeping(motion: Motion) -> Motion:
-    """The same with objects that hardly move at rest."""
+    """Return the scenes with objects that hardly move at rest."""
     awake = (motion.linear.norm(dim=-1) > SLEEP_M) | (motion.angular.norm(dim=-1) > SLEEP_RAD)
     return motion._replace(linear=motion.linear * awake[..., None], angular=motion.angular * awake[..., None])

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from osfcore.dynamics.graph import PropagationNetwork, read_network, shipped, unroll
@@ -23,7 +22,7 @@ from osfcore.dynamics.shapes import ObjectShape, ShapeTable, field_parts, object
 from osfcore.errors import CannotWrite, InvalidInput, UnknownName
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry import torch_rotations as rotations
-from osfcore.geometry.poses import rotate
+from osfcore.geometry.poses import Pose, rotate
 from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.states import SceneState
 
@@ -71,7 +70,7 @@ class PushModel:
         before: SceneState | None = None,
         pushers: Float[np.ndarray, "K 2"] | None = None,
     ) -> Rollouts:
-        """Predicted poses under K sequences of T actions.
+        """Predict poses under K sequences of T actions.
 
         Objects are put into the order of their names inside, so that the order in which they come never matters. What
         nothing can touch keeps its pose bit by bit.
@@ -88,62 +87,58 @@ class PushModel:
             UnknownName: if the shape of an object is not known.
         """
         actions = check_actions(actions)
-        self._check(state)
+        pusher = check_scene(state, self._names, "shape")
         order = sorted(range(len(state.names)), key=state.names.__getitem__)
-        names = tuple(state.names[i] for i in order)
+        begins = np.tile(pusher[:2], (len(actions), 1)) if pushers is None else pushers
         with torch.inference_mode():
-            start = self._initial_motion(state, order, names, before)
-            number = self._number(names)
-            assert state.pusher is not None  # `_check`
-            begins = np.tile(state.pusher[:2], (len(actions), 1)) if pushers is None else pushers
+            number = torch.tensor([[self._names.index(state.names[i]) for i in order]], device=self.device)
+            start = self._initial_motion(state, order, number, pusher, before)
             chunks = [slice(k, k + _CHUNK) for k in range(0, len(actions), _CHUNK)]
             parts = [self._unroll(number, start, actions[chunk], begins[chunk]) for chunk in chunks]
-        centre, turned, moved = (np.concatenate([part[i] for part in parts]) for i in range(3))
-        return self._rollouts(state, order, centre, turned, moved, pusher_path(begins, actions[..., :2]))
-
-    def _check(self, state: SceneState) -> None:
-        if not state.names:
-            raise InvalidInput("number of objects", 0, "at least 1")
-        if state.pusher is None:
-            raise InvalidInput("pusher of the state", "missing", "given: predictions start from where it is")
-        for name in state.names:
-            if name not in self._names:
-                raise UnknownName("shape", name, self._names)
-
-    def _number(self, names: tuple[str, ...]) -> Tensor:
-        return torch.tensor([self._names.index(name) for name in names], device=self.device)[None]
-
-    def _motion_at_rest(self, state: SceneState, order: list[int], number: Tensor) -> Motion:
-        """One scene in which nothing moves."""
-        assert state.pusher is not None  # checked
-        quaternion = self._tensor(state.poses.quaternion[order])
-        centre = self._tensor(state.poses.position[order]) + rotations.rotate(quaternion, self._table.centre[number[0]])
-        lowest = lowest_point(self._table, number[0], centre.float(), quaternion.float())
-        still = torch.zeros_like(centre, dtype=torch.float32)[None]
-        pusher = self._tensor(state.pusher[:2]).float()[None]
-        return Motion(centre.float()[None], quaternion.float()[None], still, still, pusher, lowest.clamp(max=0)[None])
+        placed, turned, moved = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        turned = turned.astype(float)
+        turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+        placed = placed.astype(float) - rotate(turned, self._table.centre[number[0]].cpu().numpy())
+        many = (len(actions), actions.shape[1] + 1)
+        positions, quaternions = (
+            np.broadcast_to(part, (*many, *part.shape)).copy()
+            for part in (state.poses.position, state.poses.quaternion)
+        )
+        for place, slot in enumerate(order):
+            here = moved[..., place]  # elsewhere the given pose stays
+            positions[:, 1:, slot][here] = placed[..., place, :][here]
+            quaternions[:, 1:, slot][here] = turned[..., place, :][here]
+        return Rollouts(state.names, positions, quaternions, pusher_centres(begins, actions, pusher[2]))
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(array, float), device=self.device)
 
     def _initial_motion(
-        self, state: SceneState, order: list[int], names: tuple[str, ...], before: SceneState | None
+        self, state: SceneState, order: list[int], number: Tensor, pusher: np.ndarray, before: SceneState | None
     ) -> Motion:
-        """The state with the velocities of the action before; at rest if that is not given."""
-        number = self._number(names)
-        start = self._motion_at_rest(state, order, number)
+        """Return the state with the velocities of the action before; at rest if that is not given."""
+        start = self._at_rest(state.poses[order], number, pusher)
         if before is None:
             return start
-        if sorted(before.names) != list(names):
+        if sorted(before.names) != sorted(state.names):
             raise InvalidInput("objects one action ago", ", ".join(before.names), "those of the state")
-        earlier = sorted(range(len(names)), key=before.names.__getitem__)
-        former = self._motion_at_rest(replace(before, pusher=state.pusher), earlier, number)
-        return going_on(former, start)
+        earlier = sorted(range(len(order)), key=before.names.__getitem__)
+        return going_on(self._at_rest(before.poses[earlier], number, pusher), start)
+
+    def _at_rest(self, poses: Pose, number: Int[Tensor, "1 N"], pusher: np.ndarray) -> Motion:
+        """Return one scene in which nothing moves."""
+        quaternion = self._tensor(poses.quaternion)
+        centre = self._tensor(poses.position) + rotations.rotate(quaternion, self._table.centre[number[0]])
+        centre, quaternion = centre.float(), quaternion.float()
+        floor = lowest_point(self._table, number[0], centre, quaternion).clamp(max=0)
+        still = torch.zeros_like(centre)
+        scene = (centre, quaternion, still, still, self._tensor(pusher[:2]).float(), floor)
+        return Motion(*(part[None] for part in scene))
 
     def _unroll(
         self, number: Tensor, start: Motion, actions: np.ndarray, begins: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Centres of mass, orientations and whether anything moved since the start, after each action."""
+        """Return centres of mass, orientations and whether anything moved since the start, after each action."""
         if self._packed is not None:
             return _unroll_compiled(*self._packed, number[0], start, actions, begins)
         centres, turned, moved = [], [], []
@@ -161,32 +156,35 @@ class PushModel:
                 moved.append(has_moved)
         return tuple(torch.stack(part, dim=1).cpu().numpy() for part in (centres, turned, moved))  # pyright: ignore[reportReturnType]
 
-    def _rollouts(
-        self,
-        state: SceneState,
-        order: list[int],
-        centre: Float[np.ndarray, "K T N 3"],
-        turned: Float[np.ndarray, "K T N 4"],
-        moved: Bool[np.ndarray, "K T N"],
-        path: Float[np.ndarray, "K S 2"],
-    ) -> Rollouts:
-        """Poses in the order of the state; the given ones where nothing moved."""
-        count, horizon = moved.shape[:2]
-        names = tuple(state.names[i] for i in order)
-        offsets = self._table.centre[self._number(names)[0]].cpu().numpy()
-        turned = turned.astype(float)
-        turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
-        placed = centre.astype(float) - rotate(turned, offsets)
-        positions = np.broadcast_to(state.poses.position, (count, horizon + 1, len(order), 3)).copy()
-        quaternions = np.broadcast_to(state.poses.quaternion, (count, horizon + 1, len(order), 4)).copy()
-        for place, slot in enumerate(order):
-            here = moved[..., place]
-            positions[:, 1:, slot][here] = placed[..., place, :][here]
-            quaternions[:, 1:, slot][here] = turned[..., place, :][here]
-        assert state.pusher is not None
-        path = path[:, ::SUBSTEPS]
-        height = np.full((*path.shape[:2], 1), state.pusher[2])
-        return Rollouts(state.names, positions, quaternions, np.concatenate([path, height], axis=-1))
+
+def check_scene(state: SceneState, known: Collection[str], kind: str) -> Float[np.ndarray, "3"]:
+    """Return the pusher's centre in a scene that can be predicted [m].
+
+    Args:
+        state: of the scene.
+        known: objects that can be predicted.
+        kind: what is known of them, for the error.
+
+    Raises:
+        InvalidInput: if there are no objects or no pusher.
+        UnknownName: if an object is not known.
+    """
+    if not state.names:
+        raise InvalidInput("number of objects", 0, "at least 1")
+    if state.pusher is None:
+        raise InvalidInput("pusher of the state", "missing", "given: predictions start from where it is")
+    for name in state.names:
+        if name not in known:
+            raise UnknownName(kind, name, known)
+    return state.pusher
+
+
+def pusher_centres(
+    begins: Float[np.ndarray, "*#batch 2"], actions: Float[np.ndarray, "K T 3"], height: float
+) -> Float[np.ndarray, "K T1 3"]:
+    """Return the pusher's centre before the first and after each action [m], at its height."""
+    path = pusher_path(begins, actions[..., :2])[:, ::SUBSTEPS]
+    return np.concatenate([path, np.full((*path.shape[:2], 1), height)], axis=-1)
 
 
 def _unroll_compiled(
@@ -197,7 +195,7 @@ def _unroll_compiled(
     actions: Float[np.ndarray, "K T 3"],
     begins: Float[np.ndarray, "K 2"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `PushModel._unroll` returns, without torch; what that gains: BENCHMARKS.md."""
+    """Return what `PushModel._unroll` does, without torch; BENCHMARKS.md has what that gains."""
     begins, velocity = begins.astype(np.float32), np.ascontiguousarray(actions[..., :2], np.float32)
     shifts = np.diff(pusher_path(begins, velocity.astype(float)), axis=1).astype(np.float32)
     scene = (start.centre, start.quaternion, start.linear, start.angular, start.floor)
@@ -219,13 +217,13 @@ NETWORK_FILE = "pushes.safetensors"
 
 
 def network_path(data_dir: Path | None) -> Path:
-    """DATA_DIR/dynamics/pushes.safetensors if it is there, else the package's."""
+    """Return DATA_DIR/dynamics/pushes.safetensors if it is there, else the package's."""
     own = None if data_dir is None else data_dir / "dynamics" / NETWORK_FILE
     return own if own is not None and own.is_file() else shipped()
 
 
 def load_shapes(data_dir: Path | None, fields: FieldLibrary, names: Iterable[str]) -> dict[str, ObjectShape]:
-    """The shapes of some objects by name, each from its field.
+    """Return the shapes of some objects by name, each from its field.
 
     A field that is seen for the first time is cut into convex parts, which takes up to half a minute; they are kept in
     DATA_DIR/dynamics/parts.
@@ -262,7 +260,7 @@ def _load_shape(data_dir: Path | None, fields: FieldLibrary, name: str) -> Objec
 def load_push_model(
     data_dir: Path | None, fields: FieldLibrary, names: Iterable[str], device: torch.device | str = "cpu"
 ) -> PushModel:
-    """The network with the shapes of some objects, each from its field.
+    """Return the network with the shapes of some objects, each from its field.
 
     Args:
         data_dir: as in `load_shapes`; a network in it comes before the package's.

@@ -26,7 +26,7 @@ from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.io.files import write_atomically
 
-# What dynamics knows of an object's shape, all of it from its field.
+# The shape of an object, derived from its field.
 #
 # The paper thresholds the KiloOSF's density on a grid of points (section 4.3). We take the points where the density
 # crosses the threshold along the grid's edges, which places the surface within about a millimetre instead of a
@@ -59,7 +59,7 @@ class ObjectShape:
 
 
 def object_shape(field: KiloOSF, parts: Sequence[Float[np.ndarray, "_ 3"]] = ()) -> ObjectShape:
-    """The shape that a field describes.
+    """Return the shape that a field describes.
 
     Args:
         field: of the object.
@@ -80,7 +80,7 @@ def object_shape(field: KiloOSF, parts: Sequence[Float[np.ndarray, "_ 3"]] = ())
 def solid_shape(
     corners: Float[np.ndarray, "M 3"], centre: Float[np.ndarray, "3"], parts: Sequence[Float[np.ndarray, "_ 3"]] = ()
 ) -> ObjectShape:
-    """The shape of a solid whose corners are known.
+    """Return the shape of a solid whose corners are known.
 
     Args:
         corners: of its convex hull, in the object's frame [m].
@@ -97,14 +97,13 @@ def solid_shape(
 
 
 def _support_map(corners: Float[np.ndarray, "M 3"]) -> Float32[np.ndarray, "D 3"]:
-    """The farthest corner in each direction of the octahedral map."""
+    """Return the farthest corner in each direction of the octahedral map."""
     around = corners.astype(np.float32)
-    directions = octahedral_directions(MAP_SIDE).astype(np.float32)
-    return around[np.argmax(directions @ around.T, axis=1)]
+    return around[np.argmax(octahedral_directions(MAP_SIDE).astype(np.float32) @ around.T, axis=1)]
 
 
 def _surface(density: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]:
-    """Where the density crosses the threshold along the edges of the grid, in voxels; empty space surrounds it."""
+    """Return where the density crosses the threshold along the edges of the grid [voxels]; empty space surrounds it."""
     density = np.pad(density, 1, constant_values=float(density.min()))
     points = []
     for axis in range(3):
@@ -113,14 +112,12 @@ def _surface(density: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "n 3"]
         crossing = (low > SURFACE_G) != (high > SURFACE_G)
         place = np.argwhere(crossing).astype(float)
         place[:, 0] += (SURFACE_G - low[crossing]) / (high[crossing] - low[crossing])
-        order = [1, 2]
-        order.insert(axis, 0)
-        points.append(place[:, order])
+        points.append(place[:, ((0, 1, 2), (1, 0, 2), (1, 2, 0))[axis]])
     return np.concatenate(points) - 1
 
 
 def octahedral_directions(side: int) -> Float[np.ndarray, "D 3"]:
-    """The unit vector of each cell of an octahedral map: the sphere unfolded into a square of `side` x `side`."""
+    """Return the unit vector of each cell of an octahedral map, the sphere unfolded into `side` x `side` cells."""
     u = (np.arange(side) + 0.5) / side * 2 - 1
     x, y = np.meshgrid(u, u, indexing="ij")
     z = 1 - np.abs(x) - np.abs(y)
@@ -130,7 +127,7 @@ def octahedral_directions(side: int) -> Float[np.ndarray, "D 3"]:
 
 
 def octahedral_index(directions: Float[Tensor, "*batch 3"], side: int) -> Tensor:
-    """The cell of each direction, of any length but 0."""
+    """Return the cell of each direction, of any length but 0."""
     x, y, z = directions.unbind(-1)
     length = x.abs() + y.abs() + z.abs()
     x, y = x / length, y / length
@@ -166,7 +163,7 @@ class ShapeTable:
     def farthest(
         self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "... D 3"]
     ) -> Tensor:
-        """Farthest points of A bodies in D directions of the world, relative to their centres of mass (A, D, 3) [m].
+        """Return the farthest points of A bodies in D directions, relative to their centres of mass (A, D, 3) [m].
 
         The points are those of the nearest direction on the map, 3.6 deg away at most: they reach 0.03 to 0.25 mm less
         far than the farthest ones (rms over all directions), and some millimetres less beside the normal of a face.
@@ -180,7 +177,7 @@ class ShapeTable:
         return self._support(number, local) @ rotation.transpose(1, 2)
 
     def extents(self, number: Tensor, rotation: Float[Tensor, "A 3 3"], directions: Float[Tensor, "... D 3"]) -> Tensor:
-        """How far A bodies reach in D directions of the world from their centres of mass (A, D) [m].
+        """Return how far A bodies reach in D directions of the world from their centres of mass (A, D) [m].
 
         Args:
             number: of each body in the table.
@@ -198,8 +195,8 @@ class ShapeTable:
 
 # Convex parts of what is solid in a field, and the files that keep them.
 #
-# The hull of a drill or a mug is no use for telling where it is touched. To cut a field into convex parts takes up
-# to half a minute, so the parts are kept in a file that says of which field they are.
+# The hull of a drill or a mug does not show where it is touched. To cut a field into convex parts takes up to half a
+# minute, so the parts are kept in a file that names its field.
 
 
 FORMAT = "parts-1"
@@ -211,7 +208,7 @@ Parts = tuple[Float32[np.ndarray, "_ 3"], ...]
 
 
 def field_parts(field: KiloOSF) -> Parts:
-    """Corners of convex parts that together fill what is solid in a field [m]; none if it is as good as convex."""
+    """Return corners of convex parts that fill what is solid in a field [m]; none if it is as good as convex."""
     try:
         parts = convex_parts(*field_mesh(field))
     except InvalidInput:  # thinner than a voxel somewhere: its hull has to do
@@ -220,7 +217,7 @@ def field_parts(field: KiloOSF) -> Parts:
 
 
 def field_mesh(field: KiloOSF) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 3"]]:
-    """The closed surface of what is solid in a field: vertices in the object's frame [m] and triangles.
+    """Return the closed surface of what is solid in a field: vertices in the object's frame [m] and triangles.
 
     Raises:
         InvalidInput: if nothing in the field is solid.
@@ -228,20 +225,16 @@ def field_mesh(field: KiloOSF) -> tuple[Float[np.ndarray, "P 3"], Int[np.ndarray
     from skimage.measure import marching_cubes
 
     density = np.pad(field.density.astype(np.float32), 1, constant_values=EMPTY_G)
-    solid = _without_specks(np.asarray(ndimage.binary_fill_holes(density > SURFACE_G)))
+    # a thin neck may be lost in a field: bodies of some size stay, specks go
+    labels, count = ndimage.label(ndimage.binary_fill_holes(density > SURFACE_G))  # pyright: ignore[reportGeneralTypeIssues]
+    if not count:
+        raise InvalidInput("field", "without any solid part", "a solid body")
+    sizes = ndimage.sum_labels(labels > 0, labels, range(1, count + 1))
+    solid = np.isin(labels, 1 + np.flatnonzero(sizes >= _SPECK * sizes.max()))
     density = np.where(solid, np.maximum(density, SURFACE_G + _EDGE_G), np.minimum(density, SURFACE_G - _EDGE_G))
     density[np.asarray(ndimage.binary_erosion(solid), bool)] = _INSIDE_G
     vertices, faces, _, _ = marching_cubes(density, SURFACE_G, gradient_direction="ascent")
     return field.origin + field.voxel * (vertices.astype(float) - 1), faces
-
-
-def _without_specks(solid: np.ndarray) -> np.ndarray:
-    """Bodies of some size: a thin neck may be lost in a field, and what it bears is no speck."""
-    labels, count = ndimage.label(solid)  # pyright: ignore[reportGeneralTypeIssues]
-    if not count:
-        raise InvalidInput("field", "without any solid part", "a solid body")
-    sizes = ndimage.sum_labels(solid, labels, range(1, count + 1))
-    return np.isin(labels, 1 + np.flatnonzero(sizes >= _SPECK * sizes.max()))
 
 
 def write_parts(path: Path, parts: Parts, field_digest: str) -> None:
@@ -260,7 +253,7 @@ def write_parts(path: Path, parts: Parts, field_digest: str) -> None:
 
 
 def read_parts(path: Path, field_digest: str) -> Parts | None:
-    """The parts of a field; None if the file is not there, broken or of another field, for they can be made again."""
+    """Return the parts of a field; None if the file is missing, broken or of another field: they can be made again."""
     try:
         with safe_open(path, framework="np") as file:
             metadata = file.metadata() or {}
@@ -271,11 +264,8 @@ def read_parts(path: Path, field_digest: str) -> Parts | None:
             parts = tuple(file.get_tensor(name) for name in names)
     except (SafetensorError, OSError, ValueError):
         return None
-    return parts if all(_is_body(part) for part in parts) else None
-
-
-def _is_body(part: np.ndarray) -> bool:
-    return part.ndim == 2 and part.shape[1] == 3 and len(part) > 0 and bool(np.isfinite(part).all())
+    is_sound = all(p.ndim == 2 and p.shape[1] == 3 and len(p) > 0 and np.isfinite(p).all() for p in parts)
+    return parts if is_sound else None
 
 
 # Where objects touch: outlines of their convex parts against the pusher and against each other.
@@ -343,7 +333,7 @@ class PairContact(NamedTuple):
 def outlines(
     table: ShapeTable, body: Int[Tensor, "A"], rotation: Float[Tensor, "A 3 3"], centre: Float[Tensor, "A 3"]
 ) -> Float[Tensor, "A K 2"]:
-    """Outlines of bodies seen from above [m], in the frame of `centre`.
+    """Return outlines of bodies seen from above [m], in the frame of `centre`.
 
     Args:
         table: shapes.
@@ -351,12 +341,12 @@ def outlines(
         rotation: of each body.
         centre: of mass of each body's object [m].
     """
-    flat = torch.nn.functional.pad(circle(OUTLINE, centre.device), (0, 1))
+    flat = functional.pad(circle(OUTLINE, centre.device), (0, 1))
     return table.farthest(body, rotation, flat)[..., :2] + centre[:, None, :2]
 
 
 def part_outlines(table: ShapeTable, number: int, pose: Pose) -> Float[np.ndarray, "R K 2"]:
-    """Outlines of one object's convex parts, seen from above in the world [m].
+    """Return outlines of one object's convex parts, seen from above in the world [m].
 
     Args:
         table: shapes, on the CPU.
@@ -376,7 +366,7 @@ def solids(
     centre: Float[Tensor, "A 3"],
     outline: Float[Tensor, "A K 2"],
 ) -> Solids:
-    """All convex parts of some objects.
+    """Return all convex parts of some objects.
 
     Args:
         table: shapes.
@@ -401,34 +391,30 @@ def solids(
 
 
 def pusher_contact(parts: Solids, shift: Float[Tensor, "A 2"]) -> PusherContact:
-    """Each object's nearest part to a pusher that starts at the origin."""
+    """Return the gaps between a pusher that starts at the origin and the nearest part of each object."""
     own = shift[parts.owner]
     halfway = _rim_gap(parts.outline, 0.5 * own)
     halfway = halfway._replace(distance=torch.where(parts.low < PUSHER_TOP_M, halfway.distance, FAR_M))
-    reached = halfway.distance - 0.5 * own.norm(dim=1) < TOUCH_M  # elsewhere neither end comes near
-    before, after = (_gap_where(reached, parts.outline, share * own, halfway) for share in (0.0, 1.0))
+    # where the pusher does not come near halfway, neither end does: the gap halfway stands for both
+    rows = (halfway.distance - 0.5 * own.norm(dim=1) < TOUCH_M).nonzero()[:, 0]
+    before, after = (
+        _with_rows(halfway, rows, _rim_gap(parts.outline[rows], (share * own)[rows])) for share in (0.0, 1.0)
+    )
     nearest = [_nearest(parts.owner, gap.distance, len(shift)) for gap in (before, halfway, after)]
     gaps = [_rows(gap, rows) for gap, rows in zip((before, halfway, after), nearest, strict=True)]
     return PusherContact(*gaps, face=_face(parts.outline[nearest[0]], gaps[0].normal))
 
 
 def _rim_gap(outline: Float[Tensor, "A K 2"], centre: Float[Tensor, "A 2"]) -> Gap:
-    """From outlines to the pusher's rim."""
+    """Return the gaps from outlines to the pusher's rim."""
     gap = gap_to_point(outline, centre)
     return gap._replace(distance=gap.distance - PUSHER_RADIUS_M)
-
-
-def _gap_where(chosen: Tensor, outline: Tensor, centre: Float[Tensor, "A 2"], other: Gap) -> Gap:
-    """The same for chosen outlines; the others, which are far away, keep another gap."""
-    rows = chosen.nonzero()[:, 0]
-    gap = _rim_gap(outline[rows], centre[rows])
-    return Gap(*(old.index_put((rows,), new) for old, new in zip(other, gap, strict=True)))
 
 
 def pair_contact(
     parts: Solids, outline: Float[Tensor, "A K 2"], first: Int[Tensor, "E"], second: Int[Tensor, "E"]
 ) -> PairContact:
-    """The nearest parts of pairs of objects.
+    """Return the gaps between the nearest parts of pairs of objects.
 
     Args:
         parts: of all objects.
@@ -441,13 +427,13 @@ def pair_contact(
     many = ((parts.many[first] * parts.many[second] > 1) & (gap.distance < PAIR_REACH_M)).nonzero()[:, 0]
     if len(many):
         left, right, nearest = _nearest_parts(parts, first[many], second[many])
-        gap = Gap(*(old.index_put((many,), new) for old, new in zip(gap, nearest, strict=True)))
+        gap = _with_rows(gap, many, nearest)
         a, b = a.index_put((many,), left), b.index_put((many,), right)
     return PairContact(gap, _face(parts.outline[a], gap.normal), _face(parts.outline[b], -gap.normal))
 
 
 def _nearest_parts(parts: Solids, first: Int[Tensor, "E"], second: Int[Tensor, "E"]) -> tuple[Tensor, Tensor, Gap]:
-    """Among all parts of one object and all of another the two that are nearest, and their gap."""
+    """Return the two nearest among all parts of one object and all of another, and their gap."""
     width = parts.many[second]
     total = parts.many[first] * width
     pair = torch.arange(len(first), device=first.device).repeat_interleave(total)
@@ -465,10 +451,10 @@ def _nearest_parts(parts: Solids, first: Int[Tensor, "E"], second: Int[Tensor, "
 
 
 def _separation_bound(parts: Solids, a: Int[Tensor, "R"], b: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
-    """Largest separation of two parts along the directions of outlines; `FAR_M` where one is well above the other [m].
+    """Return the largest separation of two parts along the directions of outlines [m]; `FAR_M` if one is well above.
 
-    It is a few millimetres less than their distance at most, and tells which of many pairs are worth comparing exactly:
-    two hollow objects side by side have hundreds.
+    It is a few millimetres less than their distance at most. Only pairs that it does not rule out are compared exactly,
+    for two hollow objects side by side have hundreds.
     """
     count = parts.outline.shape[1]
     reach = dot(parts.outline, circle(count, parts.outline.device))
@@ -478,7 +464,7 @@ def _separation_bound(parts: Solids, a: Int[Tensor, "R"], b: Int[Tensor, "R"]) -
 
 
 def _nearest(owner: Int[Tensor, "R"], distance: Float[Tensor, "R"], count: int) -> Int[Tensor, "A"]:
-    """Number of the nearest row of each of `count` owners, the first one where several are."""
+    """Return the number of the nearest row of each of `count` owners, the first one where several are."""
     rows = torch.arange(len(owner), device=owner.device)
     if len(owner) == count:
         return rows
@@ -491,8 +477,12 @@ def _rows(gap: Gap, rows: Int[Tensor, "E"]) -> Gap:
     return Gap(*(part[rows] for part in gap))
 
 
+def _with_rows(gap: Gap, rows: Int[Tensor, "E"], new: Gap) -> Gap:
+    return Gap(*(part.index_put((rows,), other) for part, other in zip(gap, new, strict=True)))
+
+
 def _face(outline: Float[Tensor, "A K 2"], normal: Float[Tensor, "A 2"]) -> Float[Tensor, "A 2 2"]:
-    """Both ends of the side of an outline that faces a direction; a corner gives about the same point twice."""
+    """Return both ends of the side of an outline that faces a direction; a corner gives about the same point twice."""
     count = outline.shape[1]
     middle = direction_index(normal, count)
     rows = torch.arange(len(outline), device=outline.device)

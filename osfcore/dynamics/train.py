@@ -14,7 +14,8 @@ import hashlib
 import itertools
 import math
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -62,23 +63,23 @@ from osfcore.progress import Progress
 # What training never sees, so that there is something left to measure on.
 
 
-_ONE_IN = 16  # pairs
+_PAIRS_ONE_IN = 16
 _EPISODES_ONE_IN = 12
 
 
 def is_held_out_pair(first: str, second: str) -> bool:
-    """Whether two objects never meet in training: one pair in 16, by their names alone."""
+    """Return whether two objects never meet in training: one pair in 16, by their names alone."""
     text = "+".join(sorted((first, second)))
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") % _ONE_IN == 0
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") % _PAIRS_ONE_IN == 0
 
 
 def has_held_out_pair(names: Iterable[str]) -> bool:
-    """Whether any two of the objects never meet in training."""
+    """Return whether any two of the objects never meet in training."""
     return any(is_held_out_pair(a, b) for a, b in itertools.combinations(names, 2))
 
 
 def is_for_validation(number: int) -> bool:
-    """Whether training stops by the episode of that number rather than learning from it."""
+    """Return whether training stops by the episode of that number rather than learning from it."""
     return number % _EPISODES_ONE_IN == 0
 
 
@@ -110,20 +111,17 @@ class Optimizers:
             rate: of learning, at its highest.
         """
         self.network, self.average = network, copy.deepcopy(network)
-        last = network.decoder[-1]
-        assert isinstance(last, nn.Linear)
-        inner = [p for p in network.parameters() if p.ndim == 2 and p is not last.weight]
-        held = {id(p) for p in inner}
-        others = [p for p in network.parameters() if id(p) not in held]
-        other_rate = _OTHER_RATE * rate
+        is_inner = [p.ndim == 2 and p is not network.decoder[-1].weight for p in network.parameters()]
+        inner = list(itertools.compress(network.parameters(), is_inner))
+        others = [p for p, chosen in zip(network.parameters(), is_inner, strict=True) if not chosen]
+        self._rates = (rate, _OTHER_RATE * rate)
         self._optimisers = (
             torch.optim.Muon(inner, lr=rate, weight_decay=_DECAY, ns_steps=4, adjust_lr_fn="match_rms_adamw"),
-            torch.optim.AdamW(others, lr=other_rate, weight_decay=_OTHER_DECAY),
+            torch.optim.AdamW(others, lr=self._rates[1], weight_decay=_OTHER_DECAY),
         )
-        self._rates = (rate, other_rate)
 
     def step(self, loss: Tensor, share: float, done: int) -> None:
-        """One optimization step.
+        """Make one step.
 
         Args:
             loss: to minimise.
@@ -143,15 +141,15 @@ class Optimizers:
             for kept, new in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 kept.lerp_(new, 1 - kept_share)
 
-    def state(self) -> dict[str, Any]:
-        """Everything that is needed to go on."""
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that is needed to go on."""
         return {
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
             "optimisers": [optimiser.state_dict() for optimiser in self._optimisers],
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there."""
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
@@ -163,18 +161,6 @@ class Optimizers:
 
 
 _MOVED_M = 1e-3
-
-
-class Targets(NamedTuple):
-    """Where the objects of B windows truly are after each substep.
-
-    Attributes:
-        centre: centres of mass [m].
-        quaternion: orientations.
-    """
-
-    centre: Float[Tensor, "S B N 3"]
-    quaternion: Float[Tensor, "S B N 4"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -202,14 +188,14 @@ class Recording:
     length: int
 
     @property
-    def telling(self) -> Int[np.ndarray, "chosen"]:
+    def eventful(self) -> Int[np.ndarray, "chosen"]:
         """Numbers of the windows in which something happens; of all where nothing ever does."""
         busy = np.flatnonzero(self.is_busy)
         return busy if len(busy) else np.arange(len(self.starts))
 
 
 def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], length: int) -> Recording:
-    """Episodes as tensors, with the windows that can be learned from.
+    """Return episodes as tensors, with the windows that can be learned from.
 
     Args:
         episodes: recorded with poses within their actions.
@@ -217,13 +203,11 @@ def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], l
         length: of the windows [actions].
 
     Raises:
-        InvalidInput: if the episodes were recorded without substeps, differ in length or number of objects, or are
-            shorter than a window.
+        InvalidInput: if the episodes were recorded without substeps, differ in length or number of objects, or hold no
+            such window.
     """
     order = {name: number for number, name in enumerate(sorted(shapes))}
-    sizes = {(len(e.actions), len(e.names)) for e in episodes}
-    if len(sizes) != 1 or min(sizes)[0] < length:
-        raise InvalidInput("steps and objects of the episodes", sorted(sizes), f"equal, with at least {length} steps")
+    starts = window_starts(episodes, length)
     number = np.array([[order[name] for name in e.names] for e in episodes])
     poses = [substates(e) for e in episodes]
     position, quaternion = np.stack([p.position for p in poses]), np.stack([p.quaternion for p in poses])
@@ -231,28 +215,33 @@ def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], l
     centre = position + rotate(quaternion, centres[number][:, None])
     velocity = np.stack([e.actions[:, :2] for e in episodes])
     pusher = np.stack([pusher_path(e.pusher[0, :2], e.actions[:, :2]) for e in episodes])
-    starts, is_busy = _windows(episodes, length)
-
-    def tensor(array: np.ndarray) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)
-
-    return Recording(torch.as_tensor(number), tensor(centre), tensor(quaternion), tensor(pusher), tensor(velocity),
-                     starts, is_busy, length)  # fmt: skip
+    way = np.linalg.norm(np.diff(np.stack([e.positions for e in episodes]), axis=1), axis=-1).max(axis=2)
+    happens = (way > _MOVED_M) | np.stack([e.contact for e in episodes]).any(axis=2)
+    is_busy = np.array([happens[e, t : t + length].any() for e, t in starts])
+    places = (_float32(array) for array in (centre, quaternion, pusher, velocity))
+    return Recording(torch.as_tensor(number), *places, starts=starts, is_busy=is_busy, length=length)
 
 
-def _windows(episodes: Sequence[PushEpisode], length: int) -> tuple[np.ndarray, np.ndarray]:
-    """Starts of windows in which nothing falls off the table, and whether anything happens in them."""
-    starts, busy = [], []
-    for number, e in enumerate(episodes):
-        last = len(e.actions) - length
-        safe = is_on_table(e)
-        moved = np.linalg.norm(np.diff(e.positions, axis=0), axis=-1).max(axis=1) > _MOVED_M
-        happens = moved | e.contact.any(axis=1)
-        for start in range(last + 1):
-            if safe[start : start + length + 1].all():
-                starts.append((number, start))
-                busy.append(happens[start : start + length].any())
-    return np.array(starts, int).reshape(-1, 2), np.array(busy, bool)
+def window_starts(episodes: Sequence[PushEpisode], length: int) -> Int[np.ndarray, "W 2"]:
+    """Return episode and first action of every window of `length` actions in which all objects stay on the table.
+
+    Raises:
+        InvalidInput: if the episodes differ in length or number of objects, or there is no such window.
+    """
+    sizes = {(len(e.actions), len(e.names)) for e in episodes}
+    if len(sizes) != 1 or min(sizes)[0] < length:
+        raise InvalidInput("steps and objects of the episodes", sorted(sizes), f"equal, with at least {length} steps")
+    stays = [is_on_table(e) for e in episodes]
+    last = min(sizes)[0] - length
+    starts = [(n, t) for n, safe in enumerate(stays) for t in range(last + 1) if safe[t : t + length + 1].all()]
+    if not starts:
+        what = f"windows of {length} actions in which all objects stay on the table"
+        raise InvalidInput(what, 0, "at least 1: collect more pushes")
+    return np.array(starts)
+
+
+def _float32(array: np.ndarray) -> Tensor:
+    return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)
 
 
 class Batch(NamedTuple):
@@ -262,13 +251,15 @@ class Batch(NamedTuple):
         number: shape of each object.
         motion: at their start.
         velocity: commanded in each action [m/s].
-        targets: the truth.
+        centre: true centres of mass after each substep [m].
+        quaternion: true orientations, likewise.
     """
 
     number: Int[Tensor, "B N"]
     motion: Motion
     velocity: Float[Tensor, "T B 2"]
-    targets: Targets
+    centre: Float[Tensor, "S B N 3"]
+    quaternion: Float[Tensor, "S B N 4"]
 
 
 def batch(
@@ -278,7 +269,9 @@ def batch(
     device: torch.device | str = "cpu",
     coarse: Bool[np.ndarray, "B"] | None = None,
 ) -> Batch:
-    """Windows of a recording, ready to be rolled out. Velocities at their starts are those of the substep before.
+    """Return windows of a recording, ready to be rolled out.
+
+    Velocities at their starts are those of the substep before.
 
     Args:
         recording: that holds them.
@@ -297,23 +290,17 @@ def batch(
     share = 1 / back.clamp(min=1)[:, None, None]
     linear = share * (centre[:, 0] - recording.centre[episode, first - back])
     angular = share * turn_between(recording.quaternion[episode, first - back], quaternion[:, 0])
-    actions = start[:, None] + torch.arange(recording.length)
-    number = recording.number[episode].to(device)
-
-    def put(tensor: Tensor) -> Tensor:
-        return tensor.to(device)
-
-    lowest = lowest_point(
-        table, number.flatten(), put(centre[:, 0].flatten(0, 1)), put(quaternion[:, 0].flatten(0, 1))
-    ).view(number.shape)
-    start = (centre[:, 0], quaternion[:, 0], linear, angular, recording.pusher[episode, first])
-    motion = sleeping(Motion(*[put(part) for part in start], floor=lowest.clamp(max=0)))
-    targets = Targets(put(centre[:, 1:].transpose(0, 1)), put(quaternion[:, 1:].transpose(0, 1)))
-    return Batch(number, motion, put(recording.velocity[episode[:, None], actions].transpose(0, 1)), targets)
+    begins = (centre[:, 0], quaternion[:, 0], linear, angular, recording.pusher[episode, first])
+    velocity = recording.velocity[episode[:, None], start[:, None] + torch.arange(recording.length)]
+    number, *begins = (part.to(device) for part in (recording.number[episode], *begins))
+    lowest = lowest_point(table, number.flatten(), *(part.flatten(0, 1) for part in begins[:2])).view(number.shape)
+    motion = sleeping(Motion(*begins, floor=lowest.clamp(max=0)))
+    after = (part.transpose(0, 1).to(device) for part in (velocity, centre[:, 1:], quaternion[:, 1:]))
+    return Batch(number, motion, *after)
 
 
 def turn_between(first: Tensor, second: Tensor) -> Tensor:
-    """Rotation vectors from one orientation to another [rad]."""
+    """Return the rotation vectors from one orientation to another [rad]."""
     a, b = first.double().numpy(), second.double().numpy()
     return torch.as_tensor(quaternion_log(quaternion_multiply(b, quaternion_conjugate(a))), dtype=torch.float32)
 
@@ -381,17 +368,11 @@ class _Rows:
     first: Int[Tensor, "G"]
     count: Int[Tensor, "G"]
 
-    @staticmethod
-    def of(values: Tensor, count: Int[Tensor, "G"]) -> _Rows:
-        return _Rows(values, count.cumsum(0) - count, count)
-
     def take(self, graphs: Int[Tensor, "B"]) -> Tensor:
-        """The rows of some graphs."""
-        return self.values[_ranges(self.first[graphs], self.count[graphs])]
-
-    def to(self, device: torch.device | str) -> _Rows:
-        """On another device."""
-        return _Rows(self.values.to(device), self.first.to(device), self.count.to(device))
+        """Return the rows of some graphs."""
+        count = self.count[graphs]
+        skipped = self.first[graphs] - (count.cumsum(0) - count)
+        return self.values[skipped.repeat_interleave(count) + torch.arange(int(count.sum()), device=count.device)]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -409,15 +390,11 @@ class Samples:
     paired: _Rows
 
     def __len__(self) -> int:
-        """Number of graphs."""
+        """Return the number of graphs."""
         return len(self.nodes.count)
 
-    def to(self, device: torch.device | str) -> Samples:
-        """On another device."""
-        return Samples(self.nodes.to(device), self.pushed.to(device), self.paired.to(device))
-
     def draw(self, graphs: Int[Tensor, "B"], flipped: Bool[Tensor, "B"]) -> Sample:
-        """Some graphs, those with a flag reflected."""
+        """Return some graphs, those with a flag reflected."""
         count = self.nodes.count[graphs]
         first = count.cumsum(0) - count
         nodes, pushed, paired = (rows.take(graphs) for rows in (self.nodes, self.pushed, self.paired))
@@ -435,16 +412,10 @@ class Samples:
         )
 
 
-def _ranges(first: Int[Tensor, "B"], count: Int[Tensor, "B"]) -> Int[Tensor, "R"]:
-    """first, first + 1, ..., first + count - 1 of each, one after the other."""
-    before = count.cumsum(0) - count
-    return (first - before).repeat_interleave(count) + torch.arange(int(count.sum()), device=count.device)
-
-
 def samples(
     recording: Recording, table: ShapeTable, device: torch.device | str = "cpu", others: Iterable[Substeps] = ()
 ) -> Samples:
-    """Every substep in which something can move.
+    """Return every substep in which something can move, on the device.
 
     Args:
         recording: in windows of one action.
@@ -460,14 +431,14 @@ def samples(
     parts = [_sample(*graph) for graph in graphs if graph is not None]
     if not parts:
         raise InvalidInput("number of steps in which an object could move", 0, "at least 1: collect more pushes")
-    columns = list(zip(*parts, strict=True))
-    return Samples(*(_Rows.of(torch.cat(columns[k]), torch.cat(columns[k + 1])) for k in (0, 2, 4)))
+    columns = [torch.cat(column).to(device) for column in zip(*parts, strict=True)]
+    return Samples(*(_Rows(columns[k], columns[k + 1].cumsum(0) - columns[k + 1], columns[k + 1]) for k in (0, 2, 4)))
 
 
 def _graph_and_target(
     piece: Substeps, table: ShapeTable, device: torch.device | str
 ) -> tuple[Graph, Inputs, Float[Tensor, "A 6"]] | None:
-    """Graphs of many scenes together, features and residual targets; None if everything rests."""
+    """Return graphs of many scenes together, features and residual targets; None if everything rests."""
     sweep = Sweep(headings(piece.velocity, piece.motion), piece.shift)
     motion, sweep = Motion(*(p.to(device) for p in piece.motion)), Sweep(*(p.to(device) for p in sweep))
     graph = build_graph(table, piece.number.to(device), motion, sweep)
@@ -482,7 +453,7 @@ def _graph_and_target(
 
 
 def _recorded(recording: Recording) -> Iterator[Substeps]:
-    """The substeps of a recording as they truly are and move."""
+    """Yield the substeps of a recording as they truly are and move."""
     starts = torch.as_tensor(recording.starts).repeat_interleave(SUBSTEPS, dim=0)
     steps = starts[:, 1] * SUBSTEPS + torch.arange(SUBSTEPS).repeat(len(recording.starts))
     for e, s in zip(starts[:, 0].split(_CHUNK), steps.split(_CHUNK), strict=True):
@@ -497,21 +468,19 @@ def _recorded(recording: Recording) -> Iterator[Substeps]:
 
 
 def disturbed_substeps(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape]) -> Iterator[Substeps]:
-    """What is recorded of disturbed states of episodes with the same number of objects."""
+    """Yield what is recorded of disturbed states of episodes with the same number of objects."""
     order = {name: number for number, name in enumerate(sorted(shapes))}
     disturbed = [(e, e.disturbed) for e in episodes if e.disturbed is not None and len(e.disturbed.step)]
     for first in range(0, len(disturbed), _TOGETHER):
-        columns = zip(
-            *(_disturbed(e, rows, shapes, order) for e, rows in disturbed[first : first + _TOGETHER]), strict=True
-        )
-        number, *start, velocity, shift, centre, quaternion = (torch.cat(column) for column in columns)
+        parts = [_disturbed(e, rows, shapes, order) for e, rows in disturbed[first : first + _TOGETHER]]
+        number, *start, velocity, shift, centre, quaternion = map(torch.cat, zip(*parts, strict=True))
         yield _substeps(number, tuple(start), velocity, shift, centre, quaternion)
 
 
 def _disturbed(
     episode: PushEpisode, rows: Disturbed, shapes: Mapping[str, ObjectShape], order: Mapping[str, int]
 ) -> list[Tensor]:
-    """What `_substeps` needs, of one episode."""
+    """Return what `_substeps` needs, of one episode."""
     to_centre = np.broadcast_to([shapes[name].centre for name in episode.names], rows.positions.shape)
     before, after = (rotate(q.astype(float), to_centre) for q in (rows.quaternions, rows.after_quaternions))
     path = pusher_path(episode.pusher[0, :2], episode.actions[:, :2])
@@ -521,7 +490,7 @@ def _disturbed(
         *(rows.after_positions + after, rows.after_quaternions),
     )
     number = torch.tensor([order[name] for name in episode.names]).expand(len(rows.step), -1)
-    return [number, *(torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32) for array in arrays)]
+    return [number, *map(_float32, arrays)]
 
 
 def _substeps(
@@ -532,7 +501,7 @@ def _substeps(
 
 
 def _sample(graph: Graph, features: Inputs, target: Float[Tensor, "A 6"]) -> tuple[Tensor, ...]:
-    """Rows of objects, of edges from the pusher and of edges between objects, each with its counts by graph."""
+    """Return rows of objects, of edges from the pusher and of edges between objects, each with its counts by graph."""
     _, which, count = torch.unique_consecutive(graph.scene, return_inverse=True, return_counts=True)
     first = count.cumsum(0) - count
     from_pusher = len(features.receiver) - len(features.sender)
@@ -581,20 +550,20 @@ class Validation:
 
 
 def distance(motion: Motion, pieces: Batch, step: int) -> Tensor:
-    """How far every object is from the truth after a substep (B, N) [m], its orientation included.
+    """Return how far every object is from the truth after a substep (B, N) [m], its orientation included.
 
     Args:
         motion: predicted.
         pieces: the windows, with the truth.
         step: which substep, from 0.
     """
-    shift = motion.centre - pieces.targets.centre[step]
-    turn = 2 * _sine(motion.quaternion, pieces.targets.quaternion[step])
+    shift = motion.centre - pieces.centre[step]
+    turn = 2 * _sine(motion.quaternion, pieces.quaternion[step])
     return (shift.square().sum(dim=-1) + (_ARM_M * turn).square() + 1e-8).sqrt()
 
 
 def _sine(a: Tensor, b: Tensor) -> Tensor:
-    """Sine of half the angle between orientations."""
+    """Return the sine of half the angle between orientations."""
     between = rotations.multiply(b * b.new_tensor([1.0, -1.0, -1.0, -1.0]), a)
     return (between[..., 1:].square().sum(dim=-1) + 1e-12).sqrt()
 
@@ -603,7 +572,7 @@ def _sine(a: Tensor, b: Tensor) -> Tensor:
 def validate(
     network: PropagationNetwork, table: ShapeTable, recording: Recording, device: torch.device | str = "cpu"
 ) -> Validation:
-    """Errors on windows in which something happens, or on all where nothing ever does.
+    """Return errors on windows in which something happens, or on all where nothing ever does.
 
     Args:
         network: to measure.
@@ -611,30 +580,219 @@ def validate(
         recording: held out, with one or more windows of four actions; of the busy ones 2000 at most are measured.
         device: that computes.
     """
-    chosen = np.random.default_rng(0).permutation(recording.telling)[:_MEASURED]
+    chosen = np.random.default_rng(0).permutation(recording.eventful)[:_MEASURED]
     pieces = batch(recording, table, chosen, device)
     loss, motion = 0.0, pieces.motion
     for step, motion in enumerate(unroll(network, table, pieces.number, pieces.motion, pieces.velocity)):
-        loss += float(distance(motion, pieces, step).sum()) * 1e3 / len(chosen) / len(pieces.targets.centre)
-    travel = (pieces.motion.centre - pieces.targets.centre[-1]).norm(dim=-1)
-    turned = 2 * torch.asin(_sine(pieces.motion.quaternion, pieces.targets.quaternion[-1]).clamp(max=1))
+        loss += float(distance(motion, pieces, step).sum()) * 1e3 / len(chosen) / len(pieces.centre)
+    travel = (pieces.motion.centre - pieces.centre[-1]).norm(dim=-1)
+    turned = 2 * torch.asin(_sine(pieces.motion.quaternion, pieces.quaternion[-1]).clamp(max=1))
     moved = (travel > MOVED_M) | (turned > MOVED_RAD)
-    error = 1e3 * (motion.centre - pieces.targets.centre[-1]).norm(dim=-1)[moved]
-    angle = torch.rad2deg(2 * torch.asin(_sine(motion.quaternion, pieces.targets.quaternion[-1]).clamp(max=1)))[moved]
+    error = 1e3 * (motion.centre - pieces.centre[-1]).norm(dim=-1)[moved]
+    angle = torch.rad2deg(2 * torch.asin(_sine(motion.quaternion, pieces.quaternion[-1]).clamp(max=1)))[moved]
     if not len(error):
         return Validation(0, 0.0, 0.0, 0.0, loss, 0.0)
     medians = [float(values.median()) for values in (error, angle, 1e3 * travel[moved])]
     return Validation(len(error), medians[0], medians[1], float(error.mean()), loss, medians[2])
 
 
-LONG_WINDOW = 3  # actions (paper: up to three future steps)
-_BUSY_SHARE = 0.85  # of the windows of a batch: in the others nothing happens
-_COARSE_SHARE = 0.5  # of the windows, which start with velocities as little known as in use
+# A training run on push files, with our model or the paper's: a killed one goes on, and the best weights are kept.
+
+
+UNROLLED = 3  # actions of a window (paper: up to three future steps)
 _WARM_UP = 100
 _LAST_RATE = 0.01  # of the first one
-_REPORT_EVERY, _MEASURE_EVERY, _MEASURE_LONG_EVERY = 20, 1000, 100
-_LONG_RATE = 0.1
+_REPORT_EVERY = 20
 _OWN_METRICS = ("validation_mm_4", "validation_windows")
+
+
+class PushTraining(ABC):
+    """A network that learns from push files; subclasses say how.
+
+    Args:
+        network: with the weights to begin with.
+        parts: networks and optimisers by the names they have in a checkpoint.
+        fingerprint: settings and data, which a checkpoint must agree with.
+        out: file to write.
+        total: iterations.
+        patience: measurements without a better one after which training stops.
+        seed: of what is drawn.
+
+    Attributes:
+        best: the best measurement on held-out episodes; None before the first.
+        done: iterations that are over.
+        fruitless: measurements since the best one.
+    """
+
+    measurement: type[Any]  # with at least `mm_4` and `deg_4`
+    score: str  # the field of it of which the least is the best
+    counters: tuple[str, ...] = ("done", "fruitless")  # that a checkpoint keeps
+
+    def __init__(
+        self, network: nn.Module, parts: Mapping[str, Any], fingerprint: object, *, out: Path, total: int,
+        patience: int, seed: int,
+    ) -> None:  # fmt: skip
+        self.network, self.total, self.rng = network, total, np.random.default_rng(seed)
+        self._parts, self._fingerprint, self._out, self._patience = parts, fingerprint, out, patience
+        self.best: Any = None
+        self._best_weights: dict[str, Tensor] = {}
+        self.done = self.fruitless = 0
+
+    @abstractmethod
+    def iterate(self) -> str:
+        """Make one step of descent and return a note on its loss."""
+
+    @abstractmethod
+    def is_due(self) -> bool:
+        """Return whether to measure after this iteration."""
+
+    @abstractmethod
+    def measured(self) -> tuple[Any, nn.Module]:
+        """Return the errors on held-out episodes, and the network that has them."""
+
+    @abstractmethod
+    def described(self) -> tuple[bytes, dict[str, Any]]:
+        """Return the file of the network, and what else than its errors is known of it."""
+
+    @property
+    def note(self) -> str:
+        """The best errors so far, for a person."""
+        if self.best is None:
+            return "not measured yet"
+        return f"held out: {self.best.mm_4:.1f} mm, {self.best.deg_4:.1f} deg after 4 steps"
+
+    def run(self) -> Iterator[Progress]:
+        """Descend, from the checkpoint of a killed run if there is one, and write the best weights."""
+        checkpoint = self._out.with_suffix(".checkpoint")
+        resume_from(checkpoint, self._fingerprint, self._resume)
+        while self.done < self.total and self.fruitless < self._patience:
+            note = self.iterate()
+            if self.is_due():
+                self.measure()
+                write_checkpoint(checkpoint, self._fingerprint, self._state())
+            if self.done % _REPORT_EVERY == 0:
+                yield Progress(self.done, self.total, note)
+        self.network.load_state_dict(self._best_weights)
+        data, facts = self.described()
+        write_atomically(self._out, data)
+        metrics = {f"validation_{name}": round(value, 3) for name, value in asdict(self.best).items()}
+        write_json(self._out.with_suffix(".json"), {**metrics, **facts})
+        checkpoint.unlink(missing_ok=True)
+        yield Progress(self.total, self.total, self.note)
+
+    def measure(self) -> None:
+        """Keep the weights if they are the best so far."""
+        result, network = self.measured()
+        if self.best is None or getattr(result, self.score) < getattr(self.best, self.score):
+            self.best, self.fruitless = result, 0
+            self._best_weights = {name: value.detach().cpu().clone() for name, value in network.state_dict().items()}
+        else:
+            self.fruitless += 1
+
+    def _state(self) -> dict[str, Any]:
+        """Return everything that is needed to go on."""
+        return {
+            **{name: part.state_dict() for name, part in self._parts.items()},
+            "best": self._best_weights,
+            "validation": asdict(self.best) if self.best else None,
+            "numbers": [getattr(self, name) for name in self.counters],
+            "rng": self.rng.bit_generator.state,
+        }
+
+    def _resume(self, state: dict[str, Any]) -> None:
+        for name, part in self._parts.items():
+            part.load_state_dict(state[name])
+        self._best_weights = state["best"]
+        self.best = self.measurement(**state["validation"]) if state["validation"] else None
+        for name, value in zip(self.counters, state["numbers"], strict=True):
+            setattr(self, name, value)
+        self.rng.bit_generator.state = state["rng"]
+
+
+def share_of_rate(done: int, total: int, highest: float = 1) -> float:
+    """Return the rate of learning after a warm-up and along a cosine, as a share of `highest`."""
+    falling = _LAST_RATE + (1 - _LAST_RATE) * (1 + math.cos(math.pi * done / total)) / 2
+    return highest * min(1, (done + 1) / _WARM_UP) * falling
+
+
+def prepare(config: Any, *more: tuple[str, float, float, float]) -> torch.device:  # noqa: ANN401
+    """Check settings such as `TrainDynamics` and the place to write to, and return the device that computes.
+
+    Args:
+        config: the settings.
+        more: further ones, as for `check_ranges`.
+
+    Raises:
+        InvalidInput: if a number is out of range or the device is not there.
+        CannotWrite: if the output cannot be written.
+    """
+    check_seed(config.seed)
+    check_ranges(
+        ("number of iterations", config.iterations, 1, 10_000_000),
+        ("batch", config.batch, 1, 100_000),
+        ("width of the network", config.hidden, 1, 1024),
+        ("patience", config.patience, 1, 1_000_000),
+        ("rate of learning", config.rate, 1e-9, 1),
+        *more,
+    )
+    device = pick_device(config.device)
+    check_weights_place(config.out, _OWN_METRICS)
+    return device
+
+
+def command_of(config: Any, options: Sequence[str], *method: str) -> list[str]:  # noqa: ANN401
+    """Return the words of the command that trains with such settings; options that have their default are left out."""
+    words = ["osf", "train", "dynamics", *method, "--data", *(path.name for path in config.data)]
+    words += ["--out", config.out.name]
+    default = type(config)(config.data, config.out)
+    for name in options:
+        if getattr(config, name) != getattr(default, name):
+            words += [f"--{name.replace('_', '-')}", str(getattr(config, name))]
+    return words
+
+
+def fingerprint_of(config: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Return what a checkpoint must agree with of settings such as `TrainDynamics`."""
+    return {**asdict(config), "data": [path.name for path in config.data], "out": "", "device": ""}
+
+
+def split_episodes(
+    data: Sequence[Path], known: Collection[str], is_wanted: Callable[[tuple[str, ...]], bool], advice: str
+) -> tuple[list[PushEpisode], list[PushEpisode]]:
+    """Return the episodes to learn from, and those to stop by.
+
+    Args:
+        data: push files.
+        known: objects; episodes with others are left out.
+        is_wanted: by the names of its objects, whether an episode is taken.
+        advice: what to do where nothing is left, for the error.
+
+    Raises:
+        InvalidInput: if no episode is left in either part.
+        CorruptFile: if a push file cannot be read.
+    """
+    parts: tuple[list[PushEpisode], list[PushEpisode]] = [], []
+    unknown = set[str]()
+    for path in data:
+        for number, episode in enumerate(read_sound_pushes(path)):
+            strange = set(episode.names) - set(known)
+            unknown |= strange
+            if not strange and is_wanted(episode.names):
+                parts[is_for_validation(number)].append(episode)
+    if not all(parts):
+        what = "episodes to validate on" if parts[0] else "episodes to learn from"
+        lacking = f" (objects without a field: {', '.join(sorted(unknown))})" if unknown else ""
+        raise InvalidInput(what, f"0{lacking}", f"at least 1: {advice}")
+    return parts
+
+
+# Training our network: on single substeps first, then on windows of three actions.
+
+
+_BUSY_SHARE = 0.85  # of the windows of a batch: in the others nothing happens
+_COARSE_SHARE = 0.5  # of the windows, which start with velocities as little known as in use
+_LONG_RATE = 0.1
+_MEASURE_EVERY, _MEASURE_LONG_EVERY = 1000, 100  # iterations
 
 
 @dataclass(frozen=True, slots=True)
@@ -672,12 +830,8 @@ class TrainDynamics:
     @property
     def command(self) -> str:
         """How to do it again."""
-        parts = ["osf", "train", "dynamics", "--data", *(path.name for path in self.data), "--out", self.out.name]
-        default = TrainDynamics(self.data, self.out)
-        for name in ("iterations", "batch", "long_iterations", "long_batch", "hidden", "rate", "patience", "seed"):
-            if getattr(self, name) != getattr(default, name):
-                parts += [f"--{name.replace('_', '-')}", str(getattr(self, name))]
-        return shlex.join([*parts, *(["--without", *self.without] if self.without else [])])
+        options = ("iterations", "batch", "long_iterations", "long_batch", "hidden", "rate", "patience", "seed")
+        return shlex.join([*command_of(self, options), *(["--without", *self.without] if self.without else [])])
 
 
 def train_dynamics(config: TrainDynamics, shapes: Mapping[str, ObjectShape]) -> Iterator[Progress]:
@@ -692,199 +846,91 @@ def train_dynamics(config: TrainDynamics, shapes: Mapping[str, ObjectShape]) -> 
         CorruptFile: if a push file cannot be read, or the checkpoint of a killed run cannot be gone on from.
         CannotWrite: if the output cannot be written, which is tried first.
     """
-    _check(config)
-    device = pick_device(config.device)
-    check_weights_place(config.out, _OWN_METRICS)
-    total = config.iterations + config.long_iterations
-    yield Progress(0, total, "Reading the pushes")
-    run = _Run(config, shapes, device)
-    run.resume()
-    while run.done < total:
-        note = run.iterate()
-        if run.done % run.measure_every == 0 or run.done in (config.iterations, total):
-            run.measure()
-            run.save()
-        if run.done % _REPORT_EVERY == 0:
-            yield Progress(run.done, total, note)
-    run.finish()
-    yield Progress(total, total, run.note)
-
-
-def _check(config: TrainDynamics) -> None:
-    check_seed(config.seed)
-    check_ranges(
-        ("number of iterations", config.iterations, 1, 10_000_000),
+    device = prepare(
+        config,
         ("number of iterations on windows", config.long_iterations, 0, 10_000_000),
-        ("batch", config.batch, 1, 100_000),
         ("batch of windows", config.long_batch, 1, 100_000),
-        ("width of the network", config.hidden, 1, 1024),
-        ("patience", config.patience, 1, 1_000_000),
-        ("rate of learning", config.rate, 1e-9, 1),
     )
+    yield Progress(0, config.iterations + config.long_iterations, "Reading the pushes")
+    yield from _Run(config, shapes, device).run()
 
 
-class _Run:
-    """The state of a training run."""
+class _Run(PushTraining):
+    measurement, score = Validation, "loss"
+    counters = ("done", "fruitless", "steps")
 
     def __init__(self, config: TrainDynamics, shapes: Mapping[str, ObjectShape], device: torch.device) -> None:
-        self._config, self._device = config, device
-        names = tuple(sorted(shapes))
-        self._table = ShapeTable(tuple(shapes[name] for name in names), device)
-        learned, kept = _episodes(config, frozenset(names))
-        self._long = _recording_of(learned, shapes, LONG_WINDOW)
-        drawn = samples(_recording_of(learned, shapes, 1), self._table, device, disturbed_substeps(learned, shapes))
-        self._samples = drawn.to(device)
-        self._validation = _recording_of(kept, shapes, MEASURED_WINDOW)
-        self._used = len(learned)
+        self._config, self._device, self.steps = config, device, 0
+        self._table = ShapeTable(tuple(shapes[name] for name in sorted(shapes)), device)
+
+        def is_wanted(names: tuple[str, ...]) -> bool:
+            return not set(names) & set(config.without) and not has_held_out_pair(names)
+
+        learned, kept = split_episodes(config.data, shapes, is_wanted, "collect more, or leave out fewer objects")
+        self._windows = record(learned, shapes, UNROLLED)
+        self._samples = samples(record(learned, shapes, 1), self._table, device, disturbed_substeps(learned, shapes))
+        self._validation = record(kept, shapes, MEASURED_WINDOW)
+        self._episodes = len(learned)
         torch.manual_seed(config.seed)
-        self._rng = np.random.default_rng(config.seed)
         self._descent = Optimizers(PropagationNetwork(config.hidden).to(device), config.rate)
-        self._best: dict[str, Tensor] = {}
-        self.best: Validation | None = None
-        self.done = self.fruitless = self.steps = 0
+        super().__init__(
+            self._descent.network, {"descent": self._descent},
+            repr((fingerprint_of(config), self._episodes, len(self._samples))), out=config.out,
+            total=config.iterations + config.long_iterations, patience=config.patience, seed=config.seed,
+        )  # fmt: skip
 
-    @property
-    def note(self) -> str:
-        """How good it is, for a person."""
-        if self.best is None:
-            return "not measured yet"
-        return f"held out: {self.best.mm_4:.1f} mm, {self.best.deg_4:.1f} deg after 4 steps"
-
-    @property
-    def measure_every(self) -> int:
-        """Iterations between measurements: those on windows take longer."""
-        return _MEASURE_EVERY if self.done < self._config.iterations else _MEASURE_LONG_EVERY
+    def is_due(self) -> bool:
+        every = _MEASURE_EVERY if self.done < self._config.iterations else _MEASURE_LONG_EVERY
+        return self.done % every == 0 or self.done in (self._config.iterations, self.total)
 
     def iterate(self) -> str:
-        """One step of descent."""
-        loss = self._loss_of_samples() if self.done < self._config.iterations else self._loss_of_windows()
-        self._descent.step(loss, self._share_of_rate(), self.done)
+        short, long = self._config.iterations, self._config.long_iterations
+        if self.done < short:
+            loss, share, what = self._loss_of_samples(), share_of_rate(self.done, short), "a substep"
+        else:
+            loss, share, what = self._loss_of_windows(), share_of_rate(self.done - short, long, _LONG_RATE), "a window"
+        self._descent.step(loss, share, self.done)
         self.done += 1
         self.steps += 1
-        what = "a substep" if self.done <= self._config.iterations else "a window"
         return f"loss {float(loss.detach()):.2f} mm {what}; {self.note}"
 
     def _loss_of_samples(self) -> Tensor:
-        """Mean error of single substeps [mm]."""
-        graphs = torch.as_tensor(self._rng.integers(len(self._samples), size=self._config.batch), device=self._device)
-        flipped = torch.as_tensor(self._rng.random(len(graphs)) < 0.5, device=self._device)
+        """Return the mean error of single substeps [mm]."""
+        graphs = torch.as_tensor(self.rng.integers(len(self._samples), size=self._config.batch), device=self._device)
+        flipped = torch.as_tensor(self.rng.random(len(graphs)) < 0.5, device=self._device)
         sample = self._samples.draw(graphs, flipped)
         residual = self._descent.network(sample.nodes, sample.edges, sample.receiver, sample.sender)
         scale = residual.new_tensor([SHIFT_M] * 3 + [_ARM_M * TURN_RAD] * 3)
         return 1e3 * (((residual - sample.target) * scale).square().sum(dim=1) + 1e-9).sqrt().mean()
 
     def _loss_of_windows(self) -> Tensor:
-        """Mean error over the substeps of windows of three actions [mm]."""
-        windows = _draw(self._long, self._rng, self._config.long_batch)
-        pieces = batch(self._long, self._table, windows, self._device, self._rng.random(len(windows)) < _COARSE_SHARE)
-        mirror = torch.as_tensor(self._rng.random(len(windows)) < 0.5, device=self._device)
+        """Return the mean error over the substeps of windows of three actions [mm]; in most of them things happen."""
+        count, recording = self._config.long_batch, self._windows
+        quiet = self.rng.integers(len(recording.starts), size=count - round(count * _BUSY_SHARE))
+        windows = np.concatenate([self.rng.choice(recording.eventful, count - len(quiet)), quiet])
+        pieces = batch(recording, self._table, windows, self._device, self.rng.random(count) < _COARSE_SHARE)
+        mirror = torch.as_tensor(self.rng.random(count) < 0.5, device=self._device)
         loss = torch.zeros((), device=self._device)
-        for step, motion in enumerate(self._unroll(pieces, mirror)):
+        motions = unroll(self._descent.network, self._table, pieces.number, pieces.motion, pieces.velocity, mirror)
+        for step, motion in enumerate(motions):
             loss = loss + distance(motion, pieces, step).sum()
-        return loss * (1e3 / len(windows) / len(pieces.targets.centre))
+        return loss * (1e3 / count / len(pieces.centre))
 
-    def _unroll(self, pieces: Batch, mirror: Tensor) -> Iterator[Motion]:
-        return unroll(self._descent.network, self._table, pieces.number, pieces.motion, pieces.velocity, mirror)
-
-    def _share_of_rate(self) -> float:
-        """A warm-up and a cosine for each of both parts."""
-        config = self._config
-        is_long = self.done >= config.iterations
-        done, total = (
-            (self.done - config.iterations, config.long_iterations) if is_long else (self.done, config.iterations)
-        )
-        falling = _LAST_RATE + (1 - _LAST_RATE) * (1 + math.cos(math.pi * done / total)) / 2
-        return (_LONG_RATE if is_long else 1) * min(1, (done + 1) / _WARM_UP) * falling
+    def measured(self) -> tuple[Validation, PropagationNetwork]:
+        network = self._descent.average
+        return validate(network, self._table, self._validation, self._device), network
 
     def measure(self) -> None:
-        """Keep the averaged weights if they are the best so far."""
-        result = validate(self._descent.average, self._table, self._validation, self._device)
-        if self.best is None or result.loss < self.best.loss:
-            self.best, self.fruitless = result, 0
-            kept = self._descent.average.state_dict()
-            self._best = {name: value.detach().cpu().clone() for name, value in kept.items()}
-        else:
-            self.fruitless += 1
+        super().measure()
         if self.fruitless >= self._config.patience:  # what is left of this part would be in vain
-            self.done, self.fruitless = self._next_part(), 0
+            self.done = self._config.iterations if self.done < self._config.iterations else self.total
+            self.fruitless = 0
 
-    def _next_part(self) -> int:
-        """Number of the iteration at which the next part begins."""
-        config = self._config
-        return config.iterations if self.done < config.iterations else config.iterations + config.long_iterations
-
-    @property
-    def _checkpoint(self) -> Path:
-        return self._config.out.with_suffix(".checkpoint")
-
-    def _fingerprint(self) -> str:
-        settings = {**asdict(self._config), "data": [path.name for path in self._config.data], "out": "", "device": ""}
-        return repr((settings, self._used, len(self._samples)))
-
-    def save(self) -> None:
-        """Everything that is needed to go on."""
-        content: dict[str, Any] = {
-            "descent": self._descent.state(),
-            "best": self._best,
-            "validation": asdict(self.best) if self.best else None,
-            "numbers": [self.done, self.fruitless, self.steps],
-            "rng": self._rng.bit_generator.state,
-        }
-        write_checkpoint(self._checkpoint, self._fingerprint(), content)
-
-    def resume(self) -> None:
-        """Go on from the checkpoint of the same run, if there is one."""
-        resume_from(self._checkpoint, self._fingerprint(), self._restore)
-
-    def _restore(self, content: dict[str, Any]) -> None:
-        self._descent.restore(content["descent"])
-        self._best = content["best"]
-        self.best = Validation(**content["validation"]) if content["validation"] else None
-        self.done, self.fruitless, self.steps = content["numbers"]
-        self._rng.bit_generator.state = content["rng"]
-
-    def finish(self) -> None:
-        """Write the best weights and what is known of them."""
-        assert self.best is not None
-        network = self._descent.network
-        network.load_state_dict(self._best)
-        data = network_bytes(network)
-        write_atomically(self._config.out, data)
-        metrics = {f"validation_{name}": round(value, 3) for name, value in asdict(self.best).items()}
-        own = {"iterations": self.steps, "seed": self._config.seed, "device": str(self._device), "bytes": len(data),
-               "episodes": self._used, "substeps": len(self._samples), "without": list(self._config.without),
-               "threads": torch.get_num_threads(),
-               "data": [path.name for path in self._config.data], "command": self._config.command}  # fmt: skip
-        write_json(self._config.out.with_suffix(".json"), {**metrics, **own})
-        self._checkpoint.unlink(missing_ok=True)
-
-
-def _episodes(config: TrainDynamics, known: frozenset[str]) -> tuple[list[PushEpisode], list[PushEpisode]]:
-    """What is learned from, and what is kept to stop by; nothing that is held out is in either."""
-    parts: tuple[list[PushEpisode], list[PushEpisode]] = [], []
-    unknown = set[str]()
-    for path in config.data:
-        for number, episode in enumerate(read_sound_pushes(path)):
-            unknown |= set(episode.names) - known
-            left_out = set(episode.names) & set(config.without)
-            if set(episode.names) <= known and not left_out and not has_held_out_pair(episode.names):
-                parts[is_for_validation(number)].append(episode)
-    if not all(parts):
-        what = "episodes to learn from" if not parts[0] else "episodes to validate on"
-        lacking = f" (objects without a field: {', '.join(sorted(unknown))})" if unknown else ""
-        raise InvalidInput(what, f"0{lacking}", "at least 1: collect more, or leave out fewer objects")
-    return parts
-
-
-def _recording_of(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], length: int) -> Recording:
-    recording = record(episodes, shapes, length)
-    if not len(recording.starts):
-        what = f"windows of {length} actions in which all objects stay on the table"
-        raise InvalidInput(what, 0, "at least 1: collect more pushes")
-    return recording
-
-
-def _draw(recording: Recording, rng: np.random.Generator, count: int) -> np.ndarray:
-    """Windows, most of them with something happening."""
-    quiet = rng.integers(len(recording.starts), size=count - round(count * _BUSY_SHARE))
-    return np.concatenate([rng.choice(recording.telling, count - len(quiet)), quiet])
+    def described(self) -> tuple[bytes, dict[str, Any]]:
+        config, data = self._config, network_bytes(self._descent.network)
+        return data, {
+            "iterations": self.steps, "seed": config.seed, "device": str(self._device), "bytes": len(data),
+            "episodes": self._episodes, "substeps": len(self._samples), "without": list(config.without),
+            "threads": torch.get_num_threads(),
+            "data": [path.name for path in config.data], "command": config.command,
+        }  # fmt: skip

@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from osfcore.control.estimators import Estimators, SceneModels
 from osfcore.control.events import ActionExecuted, Event, Finished, Looking, Observed, Planning, Stepped
 from osfcore.control.goal import GoalImage
 from osfcore.control.world import World
+from osfcore.errors import InvalidInput
 from osfcore.estimation.steps import EstimateStep
-from osfcore.geometry.states import EstimatedState, SceneState
+from osfcore.geometry.states import EstimatedState
 from osfcore.paper.mppi import STEPS, GaussianMPPI, GaussianPlanSettings
 from osfcore.planning.costs import ImageCost
 from osfcore.render.types import PLANNING, SceneBatch
@@ -47,7 +47,7 @@ def run_algorithm(
     estimators: Estimators,
     rng: np.random.Generator,
 ) -> Iterator[Event]:
-    """Algorithm 1, until a `Finished`.
+    """Run Algorithm 1, until a `Finished`.
 
     Args:
         world: cameras and pusher.
@@ -84,8 +84,7 @@ def run_algorithm(
         estimate = yield from _look(number + 1, _timed("estimate", later, seconds))
     estimate = estimate.with_pusher(observation.pusher)
     yield _stepped(settings.steps, settings, models, goal, estimate, seconds)
-    text = f"All {settings.steps} pushes are done."
-    yield Finished(settings.steps, "out of steps", text, estimate.state)
+    yield Finished(settings.steps, "out of steps", f"All {settings.steps} pushes are done.", estimate.state)
 
 
 def _look(number: int, steps: Iterator[EstimateStep]) -> Iterator[Event]:  # returns the EstimatedState
@@ -93,12 +92,13 @@ def _look(number: int, steps: Iterator[EstimateStep]) -> Iterator[Event]:  # ret
     for step in steps:
         estimate = step.estimate
         yield Looking(number, "next" if number else "first", step)
-    assert estimate is not None, "the last step brings the estimate"
+    if estimate is None:
+        raise InvalidInput("last step of the estimator", "without an estimate", "one that holds it")
     return estimate
 
 
 def _timed(stage: str, steps: Iterator[EstimateStep], seconds: dict[str, float]) -> Iterator[EstimateStep]:
-    """The steps; what they take, without what is done between two of them, is added up [s]."""
+    """Yield the steps, and add up the time that they take, without what is done between two of them [s]."""
     while True:
         began = time.perf_counter()
         step = next(steps, None)
@@ -116,14 +116,9 @@ def _stepped(
     estimate: EstimatedState,
     seconds: dict[str, float],
 ) -> Stepped:
-    """Distances to the goal are not known, for it has no poses here."""
-    rendered = _rendered(models, goal, estimate.state)
+    """Return the event of a step; distances to the goal are not known, for it has no poses here."""
+    batch = SceneBatch.of(replace(estimate.state, pusher=None))  # as the goal image would show it
+    rendered = models.appearance.together.render(batch, (goal.camera,), quality=PLANNING).rgb[0, 0]
     cost = float(((rendered - goal.image) ** 2).mean())
     unknown = np.zeros(0)
     return Stepped(number, settings.steps, estimate, unknown, unknown, cost, rendered, seconds)
-
-
-def _rendered(models: SceneModels, goal: GoalImage, state: SceneState) -> Float[np.ndarray, "h w 3"]:
-    """The scene as the goal image would show it, without the pusher."""
-    batch = SceneBatch.of(replace(state, pusher=None))
-    return models.appearance.together.render(batch, (goal.camera,), quality=PLANNING).rgb[0, 0]

@@ -11,14 +11,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.functional import relu
 
-from osfcore.dynamics.graph import described_sizes
-from osfcore.dynamics.motion import SUBSTEPS, pusher_path
-from osfcore.errors import CorruptFile, InvalidInput, UnknownName, shown
+from osfcore.dynamics.graph import described_sizes, parameter_bytes
+from osfcore.dynamics.rollout import check_scene, pusher_centres
+from osfcore.errors import CorruptFile, InvalidInput, shown
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.states import SceneState
@@ -26,19 +25,18 @@ from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_HEIGHT_M, PUSHER_RA
 from osfcore.io.checkpoint import load_parameters, read_parameters
 from osfcore.io.files import write_atomically
 
-# Who may touch whom, and what the network is told of each (paper eq. 8): objects and the pusher as nodes of a
-# graph.
+# The contact graph (paper eq. 8), with objects and the pusher as nodes, and the features of its nodes.
 #
 # Node 0 is the pusher, nodes 1 to N are the objects. The input of an object's node is its pose s_t in R^7, as
 # published, and which object it is. The paper's appendix with the structure of its network is not public; what
 # follows is our reading of the text:
 #
-# - which object a node is, is told by an embedding that is learned for each name (`graph_network`);
+# - which object a node is, follows from an embedding that is learned for each name;
 # - the pusher is a node as the objects are, with its position, no rotation and the action a_t; that of objects is 0;
 # - positions are in units of `LENGTH_M` and actions in units of the highest speed, so that all inputs are of order one;
-# - of the two quaternions of an orientation the one with w >= 0 is told, for they mean the same.
+# - of the two quaternions of an orientation the one with w >= 0 is the input, for they mean the same.
 #
-# Nothing else is told: world coordinates, no velocities, no shapes, no contacts.
+# Nothing else is an input: world coordinates, no velocities, no shapes, no contacts.
 
 
 LENGTH_M = 0.1  # that becomes 1, also in the loss: a centimetre there weighs as much as a turn by 11 deg
@@ -63,7 +61,7 @@ class Scenes(NamedTuple):
 
 
 def longest_axes(fields: FieldLibrary, names: Iterable[str]) -> dict[str, float]:
-    """Thresholds kappa of some objects [m]: the longest side of the box, along the object's axes, around what is dense.
+    """Return thresholds kappa of some objects [m]: the longest side of the box around what is dense.
 
     Deviation: dense in our field, at any density, whichever fields are shown.
 
@@ -75,7 +73,7 @@ def longest_axes(fields: FieldLibrary, names: Iterable[str]) -> dict[str, float]
 
 
 def adjacency(scenes: Scenes, kappa: Float[Tensor, "B N"]) -> Bool[Tensor, "B A A"]:
-    """Which of the A = N + 1 nodes may touch during the action (eq. 8).
+    """Return which of the A = N + 1 nodes may touch during the action (eq. 8).
 
         A_ij = 1 where ||p_i - p_j||^2 < kappa and i != j
 
@@ -95,7 +93,7 @@ def adjacency(scenes: Scenes, kappa: Float[Tensor, "B N"]) -> Bool[Tensor, "B A 
 
 
 def node_features(scenes: Scenes, action: Float[Tensor, "B 3"]) -> Float[Tensor, "B A F"]:
-    """Pose and action of every node.
+    """Return pose and action of every node.
 
     Args:
         scenes: where everything is.
@@ -111,7 +109,7 @@ def node_features(scenes: Scenes, action: Float[Tensor, "B 3"]) -> Float[Tensor,
 
 
 def node_numbers(objects: Int[Tensor, "B N"]) -> Int[Tensor, "B A"]:
-    """What each node is, for its embedding: the pusher first, then the objects as they are numbered."""
+    """Return the number of each node's embedding: the pusher first, then the objects as they are numbered."""
     return functional.pad(objects, (1, 0), value=PUSHER)
 
 
@@ -137,8 +135,8 @@ EMBEDDING = 16  # numbers that are learned for each name
 class GraphNetwork(nn.Module):
     """From pose, action and name of the nodes of a graph to the change of their poses.
 
-    A layer on several inputs is told as a sum of layers on each: what a node tells is then not computed again for each
-    of its edges, nor what an edge tells again in each step.
+    A layer on several inputs is written as a sum of layers on each. So the part of a node is not computed again for
+    each of its edges, nor the part of an edge in each step.
 
     Args:
         names: of the objects that it knows, which have the numbers 2, 3, ...; all others have the number 0 and the
@@ -168,13 +166,13 @@ class GraphNetwork(nn.Module):
         nn.init.zeros_(self.answer.bias)
 
     def number(self, name: str) -> int:
-        """What a node of that name is called in `forward`."""
+        """Return the number of an object with that name."""
         return self.names.index(name) + 2 if name in self.names else UNKNOWN
 
     def forward(
         self, features: Float[Tensor, "B A F"], number: Int[Tensor, "B A"], adjacency: Bool[Tensor, "B A A"]
     ) -> Float[Tensor, "B A 7"]:
-        """The change of position (in units of `graph.LENGTH_M`) and quaternion of every node.
+        """Return the change of position (in units of `LENGTH_M`) and quaternion of every node.
 
         Args:
             features: pose and action of the nodes.
@@ -185,20 +183,17 @@ class GraphNetwork(nn.Module):
         own = nodes
         for layer in self.node_encoder:
             own = relu(layer(own))
-        relation = self.edge_propagator_relation(self._encoded_edges(nodes))
-        told = self.node_propagator_own(own)
+        receiver, sender = self.edge_encoder_receiver(nodes), self.edge_encoder_sender(nodes)
+        edges = relu(self.edge_encoder_last(relu(receiver[:, :, None] + sender[:, None])))
+        relation, constant = self.edge_propagator_relation(edges), self.node_propagator_own(own)
         is_edge = adjacency[:, :, None].to(own.dtype)  # (B, A, 1, A)
         state = torch.zeros_like(own)
         for _ in range(self.steps):
             receiver, sender = self.edge_propagator_receiver(state), self.edge_propagator_sender(state)
             effects = relu(relation + receiver[:, :, None] + sender[:, None])
             effect = (is_edge @ effects)[:, :, 0]
-            state = relu(state + told + self.node_propagator_state(state) + self.node_propagator_effect(effect))
+            state = relu(state + constant + self.node_propagator_state(state) + self.node_propagator_effect(effect))
         return self.answer(relu(self.decoder(torch.cat([own, state], dim=2))))
-
-    def _encoded_edges(self, nodes: Float[Tensor, "B A X"]) -> Float[Tensor, "B A A H"]:
-        receiver, sender = self.edge_encoder_receiver(nodes), self.edge_encoder_sender(nodes)
-        return relu(self.edge_encoder_last(relu(receiver[:, :, None] + sender[:, None])))
 
 
 # Poses after each action by the paper's network, and the loss that it is trained with.
@@ -215,7 +210,7 @@ def unroll(
     actions: Float[Tensor, "B T 3"],
     pusher: Float[Tensor, "B T1 3"],
 ) -> Iterator[Scenes]:
-    """The scenes after each action, each predicted from the one before.
+    """Yield the scenes after each action, each predicted from the one before.
 
     Args:
         network: predicts one action.
@@ -229,17 +224,17 @@ def unroll(
     for step in range(actions.shape[1]):
         features = node_features(scenes, actions[:, step])
         change = network(features, numbers, adjacency(scenes, kappa))[:, 1:]
-        # the network was told the quaternion with w >= 0, so its change belongs to that one
-        told = features[:, 1:, 3:7]
         position = scenes.position + LENGTH_M * change[..., :3]
-        scenes = Scenes(position, functional.normalize(told + change[..., 3:], dim=-1), pusher[:, step + 1])
+        # the change is of the quaternion that the network saw, with w >= 0
+        quaternion = functional.normalize(features[:, 1:, 3:7] + change[..., 3:], dim=-1)
+        scenes = Scenes(position, quaternion, pusher[:, step + 1])
         yield scenes
 
 
 def squared_error(
     predicted: Scenes, position: Float[Tensor, "B N 3"], quaternion: Float[Tensor, "B N 4"]
 ) -> Float[Tensor, ""]:
-    """Squared error of position and quaternion, summed across the objects of a scene, mean over the scenes.
+    """Return the squared error of position and quaternion, summed across objects, mean over the scenes.
 
     Of the two quaternions of the true orientation the nearer one counts. The paper gives no unit of length; here it is
     `LENGTH_M`.
@@ -264,21 +259,20 @@ _MOST_NAMES = 10_000
 
 
 def weights_path(data_dir: Path | None) -> Path:
-    """DATA_DIR/dynamics/paper_pushes.safetensors if it is there, else the package's."""
+    """Return DATA_DIR/dynamics/paper_pushes.safetensors if it is there, else the package's."""
     own = None if data_dir is None else data_dir / "dynamics" / WEIGHTS_FILE
     return own if own is not None and own.is_file() else shipped()
 
 
 def shipped() -> Path:
-    """The file of the network that comes with the package."""
+    """Return the file of the network that comes with the package."""
     return Path(str(files("osfcore.paper") / "shipped" / "pushes.safetensors"))
 
 
 def network_bytes(network: GraphNetwork) -> bytes:
-    """A network as the contents of a file."""
-    tensors = {name: value.detach().cpu().half().contiguous() for name, value in network.state_dict().items()}
+    """Return a network as the contents of a file."""
     words = {"hidden": str(network.hidden), "steps": str(network.steps), "names": json.dumps(network.names)}
-    return save(tensors, {"format": FORMAT, **words})
+    return parameter_bytes(network, {"format": FORMAT, **words})
 
 
 def write_network(path: Path, network: GraphNetwork) -> None:
@@ -305,7 +299,7 @@ def read_network(path: Path) -> GraphNetwork:
 
 
 def _names(metadata: Mapping[str, str], path: Path) -> list[str]:
-    """The objects that a file says its network knows."""
+    """Return the objects that a network knows by the metadata of its file."""
     try:
         names: list[str] = json.loads(metadata["names"])
     except (KeyError, ValueError, RecursionError) as error:
@@ -349,7 +343,7 @@ class PaperPushModel:
     def rollout(
         self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: SceneState | None = None
     ) -> Rollouts:
-        """Predicted poses under K sequences of T actions.
+        """Predict poses under K sequences of T actions.
 
         Objects are put into the order of their names inside, so that the order in which they come never matters.
 
@@ -364,48 +358,34 @@ class PaperPushModel:
             UnknownName: if the longest axis of an object is not known.
         """
         actions = check_actions(actions)
-        pusher = self._pusher_of(state, actions)
+        start = check_scene(state, self._kappas, "longest axis")
+        pusher = pusher_centres(start[:2], actions, start[2])
         order = np.argsort(state.names)
         slots = np.argsort(order)
         with torch.inference_mode():
-            parts = [
-                self._unroll(state, order, actions[k : k + _CHUNK], pusher[k : k + _CHUNK])
-                for k in range(0, len(actions), _CHUNK)
-            ]
-        position, quaternion = (np.concatenate([part[i] for part in parts]).astype(float) for i in range(2))
-        quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
-        given = (state.poses.position, state.poses.quaternion)
-        first = [np.broadcast_to(part, (len(actions), 1, *part.shape)) for part in given]
-        positions = np.concatenate([first[0], position[:, :, slots]], axis=1)
-        quaternions = np.concatenate([first[1], quaternion[:, :, slots]], axis=1)
+            chunks = [slice(k, k + _CHUNK) for k in range(0, len(actions), _CHUNK)]
+            parts = [self._unroll(state, order, actions[chunk], pusher[chunk]) for chunk in chunks]
+        placed, turned = (np.concatenate([part[i] for part in parts]).astype(float)[:, :, slots] for i in range(2))
+        turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+        positions, quaternions = (
+            np.concatenate([np.broadcast_to(given, (len(actions), 1, *given.shape)), found], axis=1)
+            for given, found in ((state.poses.position, placed), (state.poses.quaternion, turned))
+        )
         return Rollouts(state.names, positions, quaternions, pusher)
-
-    def _pusher_of(self, state: SceneState, actions: Float[np.ndarray, "K T 3"]) -> Float[np.ndarray, "K T1 3"]:
-        """Where the actions take the pusher, at its height."""
-        if not state.names:
-            raise InvalidInput("number of objects", 0, "at least 1")
-        if state.pusher is None:
-            raise InvalidInput("pusher of the state", "missing", "given: predictions start from where it is")
-        for name in state.names:
-            if name not in self._kappas:
-                raise UnknownName("longest axis", name, self._kappas)
-        path = pusher_path(state.pusher[:2], actions[..., :2])[:, ::SUBSTEPS]
-        return np.concatenate([path, np.full((*path.shape[:2], 1), state.pusher[2])], axis=-1)
 
     def _unroll(
         self, state: SceneState, order: np.ndarray, actions: np.ndarray, pusher: np.ndarray
     ) -> tuple[Float[np.ndarray, "K T N 3"], Float[np.ndarray, "K T N 4"]]:
-        """Poses after each action, in the order of names."""
+        """Return poses after each action, in the order of names."""
         count, names = len(actions), [state.names[i] for i in order]
-        number = torch.tensor([self._network.number(name) for name in names], device=self.device)
-        kappa = self._tensor(np.array([self._kappas[name] for name in names]))
-        position = self._tensor(state.poses.position[order]).expand(count, -1, -1)
-        quaternion = self._tensor(state.poses.quaternion[order]).expand(count, -1, -1)
+        number = torch.tensor([self._network.number(name) for name in names], device=self.device).expand(count, -1)
+        kappa = self._tensor(np.array([self._kappas[name] for name in names])).expand(count, -1)
+        places = (state.poses.position, state.poses.quaternion)
+        position, quaternion = (self._tensor(part[order]).expand(count, -1, -1) for part in places)
         start = Scenes(position, quaternion, self._tensor(pusher[:, 0]))
-        number, kappa = number.expand(count, -1), kappa.expand(count, -1)
         scenes = list(unroll(self._network, number, kappa, start, self._tensor(actions), self._tensor(pusher)))
-        placed, turned = ([getattr(s, name) for s in scenes] for name in ("position", "quaternion"))
-        return torch.stack(placed, dim=1).cpu().numpy(), torch.stack(turned, dim=1).cpu().numpy()
+        placed, turned = torch.stack([s.position for s in scenes], 1), torch.stack([s.quaternion for s in scenes], 1)
+        return placed.cpu().numpy(), turned.cpu().numpy()
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32, device=self.device)
@@ -414,7 +394,7 @@ class PaperPushModel:
 def load_paper_push_model(
     data_dir: Path | None, fields: FieldLibrary, names: Iterable[str], device: torch.device | str = "cpu"
 ) -> PaperPushModel:
-    """The paper's network with the longest axes of some objects, each from its field.
+    """Return the paper's network with the longest axes of some objects, each from its field.
 
     Args:
         data_dir: DATA_DIR; a network in it comes before the package's.

@@ -20,12 +20,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from osfcore.errors import InvalidInput
 from osfcore.estimation.objective import FINE_SIDE, ObjectModels, ObservedViews, SceneParameters, views_of
 from osfcore.estimation.search import CMAES, StepReporter
-from osfcore.estimation.steps import EstimateStep, Stage
+from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState, Observation, SceneState
@@ -81,26 +81,24 @@ def estimate_first(
     models.check(observation.names)
     if observation.masks is None:
         raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
-    views = views_of(observation, FINE_SIDE // 2)
-    starts = [_triangulated(observation, n) for n in range(len(observation.names))]
-    upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(starts), 1))
-    params = SceneParameters(
-        observation.names, np.array(starts).reshape(-1, 3), upright, np.array(OVERHEAD), observation.pusher
+    views, names = views_of(observation, FINE_SIDE // 2), observation.names
+    starts = np.array([_triangulated(observation, observation.masks[:, n], n) for n in range(len(names))]).reshape(
+        -1, 3
     )
+    upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(names), 1))
+    params = SceneParameters(names, starts, upright, np.array(OVERHEAD), observation.pusher)
     reporter = StepReporter(config.masked_iterations + config.joint_iterations + 1)
     spread = (*config.masked_spread, 0.0)
-    searches = [_Search(_one(params, n), spread, config.masked_population, rng) for n in range(len(starts))]
+    alone = [SceneParameters((name,), starts[[n]], upright[[n]], params.light, None) for n, name in enumerate(names)]
+    searches = [_Search(one, spread, config.masked_population, rng) for one in alone]
     for _ in range(config.masked_iterations):
         tried, losses = [], []
         for n, search in enumerate(searches):
             batch = search.ask()
             losses.append(search.tell(masked_error(models, views, n, batch)))
             tried.append(Pose(batch.positions[:, 0], batch.quaternions[:, 0]))
-        params = replace(
-            params,
-            positions=np.concatenate([s.best.positions for s in searches]),
-            quaternions=np.concatenate([s.best.quaternions for s in searches]),
-        )
+        positions, quaternions = ([getattr(s.best, part) for s in searches] for part in ("positions", "quaternions"))
+        params = replace(params, positions=np.concatenate(positions), quaternions=np.concatenate(quaternions))
         sigma = searches[0].sigma if searches else 1.0
         yield reporter.step("objects", "Each object in its masks", params, tried, losses, sigma)
     search = _Search(params, config.joint_spread, config.joint_population, rng)
@@ -138,7 +136,7 @@ def estimate_next(
 
 
 def masked_error(models: ObjectModels, views: ObservedViews, number: int, batch: SceneBatch) -> Float[np.ndarray, "B"]:
-    """Eq. 5: mean squared difference between one object rendered alone and the images inside its masks.
+    """Return eq. 5: mean squared difference between one object rendered alone and the images inside its masks.
 
     Args:
         models: fields.
@@ -146,7 +144,8 @@ def masked_error(models: ObjectModels, views: ObservedViews, number: int, batch:
         number: of the object in the views.
         batch: B scenes of this object alone, whose light does not count: L_init is overhead.
     """
-    assert views.masks is not None
+    if views.masks is None:
+        raise InvalidInput("masks of the views", "missing", "given: one per camera and object")
     wanted = views.images * views.masks[:, number, ..., None]
     overhead = np.broadcast_to(OVERHEAD, batch.lights.shape)
     alone = SceneBatch(batch.names, batch.positions, batch.quaternions, overhead, None)
@@ -154,7 +153,7 @@ def masked_error(models: ObjectModels, views: ObservedViews, number: int, batch:
 
 
 def scene_error(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> Float[np.ndarray, "B"]:
-    """Eq. 6: mean squared difference between B whole scenes, with shadows, and the images.
+    """Return eq. 6: mean squared difference between B whole scenes, with shadows, and the images.
 
     Args:
         models: fields of the objects and the table.
@@ -174,7 +173,7 @@ def _descend(
     models: ObjectModels, views: ObservedViews, search: _Search, iterations: int, reporter: StepReporter, *,
     has_masks: bool,
 ) -> Iterator[EstimateStep]:  # fmt: skip
-    """CMA-ES over all poses and the light; with masks, eq. 5 of every object is added to eq. 6."""
+    """Run CMA-ES over all poses and the light; with masks, eq. 5 of every object is added to eq. 6."""
     names = search.best.names
     loss = np.inf
     for _ in range(iterations):
@@ -185,9 +184,8 @@ def _descend(
             errors = errors + masked_error(models, views, n, own)
         loss = search.tell(errors)
         tried = [Pose(batch.positions[:, n], batch.quaternions[:, n]) for n in range(len(names))]
-        stage: Stage = "together"
-        light = " and the light" if search.scales[2] else ""
-        yield reporter.step(stage, f"All objects{light}", search.best, tried, [], search.sigma, batch.lights, loss)
+        note = "All objects and the light" if search.scales[2] else "All objects"
+        yield reporter.step("together", note, search.best, tried, [], search.sigma, batch.lights, loss)
     shift, turn, light = (scale * search.sigma for scale in search.scales)
     deviations = np.full(len(names), shift), np.full(len(names), 2 * turn)
     estimate = EstimatedState(search.best.state(), *deviations, light, ("",) * len(names), "")
@@ -213,7 +211,7 @@ class _Search:
         return self._strategy.sigma
 
     def ask(self) -> SceneBatch:
-        """The scenes of the next generation."""
+        """Return the scenes of the next generation."""
         changes = self._strategy.ask()
         count = len(self._start.names)
         poses = changes[:, : POSE * count].reshape(len(changes), count, POSE)
@@ -228,34 +226,20 @@ class _Search:
         return self._asked
 
     def tell(self, losses: Float[np.ndarray, "B"]) -> float:
-        """Losses of these scenes; returns the least so far."""
-        assert self._asked is not None
+        """Take the losses of these scenes and return the least so far."""
         self._strategy.tell(losses)
-        k = int(np.argmin(losses))
-        if losses[k] < self._least:
-            self._least, batch = float(losses[k]), self._asked
-            found = batch.positions[k], batch.quaternions[k], batch.lights[k]
-            self.best = replace(self.best, positions=found[0], quaternions=found[1], light=found[2])
+        k, batch = int(np.argmin(losses)), self._asked
+        if losses[k] < self._least and batch is not None:
+            self._least = float(losses[k])
+            poses = {"positions": batch.positions[k], "quaternions": batch.quaternions[k]}
+            self.best = replace(self.best, **poses, light=batch.lights[k])
         return self._least
 
 
-def _one(params: SceneParameters, n: int) -> SceneParameters:
-    """One object of a scene, without the pusher."""
-    own = slice(n, n + 1)
-    return replace(
-        params,
-        names=params.names[own],
-        positions=params.positions[own],
-        quaternions=params.quaternions[own],
-        pusher=None,
-    )
-
-
-def _triangulated(observation: Observation, n: int) -> Float[np.ndarray, "3"]:
-    """The point closest to the lines of sight through the centroids of an object's masks [m]."""
-    assert observation.masks is not None
+def _triangulated(observation: Observation, masks: Bool[np.ndarray, "V h w"], n: int) -> Float[np.ndarray, "3"]:
+    """Return the point closest to the lines of sight through the centroids of the masks of object n [m]."""
     normal, target = 1e-6 * np.eye(3), np.zeros(3)
-    for camera, mask in zip(observation.cameras, observation.masks[:, n], strict=True):
+    for camera, mask in zip(observation.cameras, masks, strict=True):
         rows, columns = np.nonzero(mask)
         if not len(rows):
             continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -42,7 +42,7 @@ _SOLID_G = 1.0  # of an occupied corner; any number above the floor
 
 
 def layer_shapes(width: int) -> tuple[tuple[int, int], ...]:
-    """Inputs and outputs of each layer of a tiny network, in the order of its parameters."""
+    """Return inputs and outputs of each layer of a tiny network, in the order of its parameters."""
     return (
         (POSITION_INPUTS, width),
         (width, width),
@@ -53,7 +53,7 @@ def layer_shapes(width: int) -> tuple[tuple[int, int], ...]:
 
 
 def network_size(width: int) -> int:
-    """Number of parameters of one tiny network: weights (inputs x outputs), then biases, layer by layer."""
+    """Return the number of parameters of one tiny network: weights (inputs x outputs), then biases, layer by layer."""
     return sum((inputs + 1) * outputs for inputs, outputs in layer_shapes(width))
 
 
@@ -118,7 +118,7 @@ def first_field(
     most_networks: int,
     rng: np.random.Generator,
 ) -> TinyField:
-    """Networks with first weights in every cell that holds something.
+    """Return networks with first weights in every cell that holds something.
 
     Args:
         origin: corner (0, 0, 0) of the occupancy grid [m].
@@ -133,17 +133,16 @@ def first_field(
     while cells.max() >= most_networks and across > 1:
         across -= 1
         cells = _cells(occupied, across)
-    parts = []
+    parts, count = [], cells.max() + 1
     for inputs, outputs in layer_shapes(width):
         bound = (6 / inputs) ** 0.5
-        weights = rng.uniform(-bound, bound, (cells.max() + 1, inputs * outputs))
-        parts += [weights, np.zeros((cells.max() + 1, outputs))]
+        parts += [rng.uniform(-bound, bound, (count, inputs * outputs)), np.zeros((count, outputs))]
     networks = np.concatenate(parts, axis=1).astype(np.float32)
     return TinyField(origin, voxel, occupied, cells, networks, width)
 
 
 def _cells(occupied: Bool[np.ndarray, "nx ny nz"], across: int) -> Int32[np.ndarray, "cx cy cz"]:
-    """Numbers for the cells of a grid that hold an occupied corner or touch one, -1 for the others."""
+    """Return numbers for the cells of a grid that hold an occupied corner or touch one, -1 for the others."""
     spans = np.array(occupied.shape) - 1
     counts = np.maximum(np.round(across * spans / spans.max()), 1).astype(int)
     holds = np.zeros(counts, bool)
@@ -182,14 +181,13 @@ class TinyQuery(nn.Module):
         """Where it computes."""
         return self.networks.device
 
-    def to_field(self, grid: TinyField, occupied: Bool[np.ndarray, "nx ny nz"] | None = None) -> TinyField:
-        """The present numbers as a field on the grid of `grid`, with another occupancy if one is given."""
+    def to_field(self, grid: TinyField, occupied: Bool[np.ndarray, "nx ny nz"]) -> TinyField:
+        """Return the present numbers as a field with the grid and cells of another, and its own occupancy."""
         networks = self.networks.detach().cpu().numpy().copy()
-        kept = grid.occupied if occupied is None else occupied
-        return TinyField(grid.origin, grid.voxel, kept, grid.cells, networks, grid.width)
+        return TinyField(grid.origin, grid.voxel, occupied, grid.cells, networks, grid.width)
 
     def density(self, x: Float[Tensor, "S 3"]) -> Float[Tensor, "S"]:
-        """Density at points of the object's frame [1/m]; 0 in cells without a network."""
+        """Return the density at points of the object's frame [1/m]; 0 in cells without a network."""
         return self._evaluate(x, None)[0]
 
     def forward(self, x: Float[Tensor, "S 3"], light: Float[Tensor, "S 3"], view: Float[Tensor, "S 3"]) -> Scatter:
@@ -207,7 +205,7 @@ class TinyQuery(nn.Module):
     def _evaluate(
         self, x: Float[Tensor, "S 3"], directions: Float[Tensor, "S d"] | None
     ) -> tuple[Float[Tensor, "S"], Float[Tensor, "S 3"]]:
-        """Density, and rho if directions are given."""
+        """Return the density, and rho if directions are given."""
         place = (x - self.low) / self.cell_size
         last = torch.tensor(self.counts, device=x.device) - 1
         cell = torch.minimum(place.floor().clamp(min=0).long(), last)
@@ -228,7 +226,7 @@ class TinyQuery(nn.Module):
     def _run_sorted(
         self, number: Int[Tensor, "S"], local: Float[Tensor, "S p"], directions: Float[Tensor, "S d"] | None
     ) -> Float[Tensor, "S o"]:
-        """Each input through its own network: padded to equal counts and multiplied as a batch."""
+        """Put each input through its own network: they are padded to equal counts and multiplied as a batch."""
         asked, counts = torch.unique_consecutive(number, return_counts=True)
         most = int(counts.max())
         starts = torch.repeat_interleave(torch.cumsum(counts, 0) - counts, counts)
@@ -239,29 +237,22 @@ class TinyQuery(nn.Module):
             flat = rows.new_zeros(len(asked) * most, rows.shape[1]).index_copy(0, slot, rows)
             return flat.view(len(asked), most, -1)
 
-        layers = self._layers(self.networks[asked])
-        h = torch.relu(_linear(batched(local), next(layers)))
-        h = torch.relu(_linear(h, next(layers)))
-        h = _linear(h, next(layers))
+        networks, shapes = self.networks[asked], layer_shapes(self.width)
+        starts = np.cumsum([0, *((inputs + 1) * outputs for inputs, outputs in shapes)]).tolist()
+
+        def linear(layer: int, a: Float[Tensor, "C n i"]) -> Float[Tensor, "C n o"]:
+            inputs, outputs = shapes[layer]
+            bias = starts[layer] + inputs * outputs
+            weights = networks[:, starts[layer] : bias].view(-1, inputs, outputs)
+            return torch.baddbmm(networks[:, bias : starts[layer + 1]].unsqueeze(1), a, weights)
+
+        h = torch.relu(linear(0, batched(local)))
+        h = linear(2, torch.relu(linear(1, h)))
         out = h[..., self.width :]
         if directions is not None:
-            h = torch.cat([h[..., : self.width], batched(directions)], dim=-1)
-            h = torch.relu(_linear(h, next(layers)))
-            out = torch.cat([out, _linear(h, next(layers))], dim=-1)
+            h = torch.relu(linear(3, torch.cat([h[..., : self.width], batched(directions)], dim=-1)))
+            out = torch.cat([out, linear(4, h)], dim=-1)
         return out.reshape(len(asked) * most, -1)[slot]
-
-    def _layers(self, networks: Float[Tensor, "C P"]) -> Iterator[tuple[Tensor, Tensor]]:
-        """Weights (C, inputs, outputs) and biases (C, 1, outputs) of each layer."""
-        start = 0
-        for inputs, outputs in layer_shapes(self.width):
-            end = start + inputs * outputs
-            yield networks[:, start:end].view(-1, inputs, outputs), networks[:, end : end + outputs].unsqueeze(1)
-            start = end + outputs
-
-
-def _linear(a: Float[Tensor, "C n i"], layer: tuple[Tensor, Tensor]) -> Float[Tensor, "C n o"]:
-    weights, biases = layer
-    return torch.baddbmm(biases, a, weights)
 
 
 # Files of KiloOSFs as published: safetensors with half-precision networks, checked when read.
@@ -272,7 +263,7 @@ _MOST_CORNERS = 20_000_000
 
 
 def field_bytes(field: TinyField) -> bytes:
-    """A field as the contents of a file."""
+    """Return a field as the contents of a file."""
     tensors = {
         "origin": field.origin,
         "voxel": np.array([field.voxel], np.float32),
@@ -294,7 +285,7 @@ def read_field(path: Path) -> TinyField:
 
 
 def field_from_bytes(data: bytes, where: Path | str) -> TinyField:
-    """A field from the contents of a file.
+    """Return a field from the contents of a file.
 
     Args:
         data: as `field_bytes` makes them.
@@ -309,10 +300,9 @@ def field_from_bytes(data: bytes, where: Path | str) -> TinyField:
 def _field(content: tuple[Mapping[str, str], Mapping[str, np.ndarray]], where: Path | str) -> TinyField:
     meta, tensors = content
     try:
-        field = _parsed(int(meta["width"]), tensors)
+        return _parsed(int(meta["width"]), tensors)
     except (KeyError, ValueError, IndexError, TypeError, OverflowError) as error:
         raise CorruptFile(where, f"it is not a sound field ({shown(error)})") from error
-    return field
 
 
 def _parsed(width: int, tensors: Mapping[str, np.ndarray]) -> TinyField:

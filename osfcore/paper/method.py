@@ -14,12 +14,12 @@ _FOLDER = "paper_fields"
 
 
 def own_field_path(name: str, data_dir: Path) -> Path:
-    """Where a KiloOSF as published that was trained on this machine lies: DATA_DIR/paper_fields/NAME.safetensors."""
+    """Return where a KiloOSF as published that this machine trained lies: DATA_DIR/paper_fields/NAME.safetensors."""
     return data_dir / _FOLDER / f"{name}.safetensors"
 
 
 def paper_field_path(name: str, data_dir: Path | None) -> Path:
-    """Where an object's KiloOSF as published lies: that trained on this machine, else the package's.
+    """Return where an object's KiloOSF as published lies: that trained on this machine, else the package's.
 
     Raises:
         UnknownName: if there is none.
@@ -32,11 +32,11 @@ def paper_field_path(name: str, data_dir: Path | None) -> Path:
 
 
 def paper_field_names(data_dir: Path | None) -> tuple[str, ...]:
-    """Objects with a KiloOSF as published, in order."""
+    """Return the objects with a KiloOSF as published, in order."""
     return tuple(sorted({path.stem for folder in _field_folders(data_dir) for path in folder.glob("*.safetensors")}))
 
 
 def _field_folders(data_dir: Path | None) -> tuple[Path, ...]:
-    """Where to look, in this order."""
+    """Return where to look, in this order."""
     shipped = Path(str(files("osfcore.paper") / "shipped" / "fields"))
     return (shipped,) if data_dir is None else (data_dir / _FOLDER, shipped)

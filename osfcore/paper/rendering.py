@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
+from collections import namedtuple
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from osfcore.errors import InvalidInput
@@ -30,6 +30,7 @@ from osfcore.paper.fields import (
     network_size,
 )
 from osfcore.render.kernels import FAR, HELPER, KERNEL, TINY, meet_table, pixel_ray, table_colour
+from osfcore.render.renderer import plain_table, screen_boxes, z_depth
 from osfcore.render.types import EXACT, MASK_OPACITY, Quality, Rendered, SceneBatch, camera_numbers, check_request
 
 # Compiled evaluation of tiny networks along rays: next occupied sample, density, radiance transfer.
@@ -43,10 +44,10 @@ _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.flo
 
 @numba.njit(**HELPER)
 def next_occupied(pack, a, o, d, inverse, n, k, last, step):
-    """The next sample of a ray in an occupied voxel of field a; past `last` if there is none.
+    """Return the next sample of a ray in an occupied voxel of field a; past `last` if there is none.
 
     Args:
-        pack, a: fields (`packing.PackedTiny`), and which one.
+        pack, a: fields (`PackedTiny`), and which one.
         o, d, inverse, n: rows n hold the ray's origin [voxels], direction [voxels/m], and each component inverted.
         k, last: sample to begin with, and the ray's last one; sample k lies at (k + 1/2) * step.
         step: between samples [m].
@@ -61,9 +62,8 @@ def next_occupied(pack, a, o, d, inverse, n, k, last, step):
         bx, by, bz = i >> MACRO_BITS, j >> MACRO_BITS, m >> MACRO_BITS
         free = np.int64(pack.macro[blocks + (bx * my + by) * mz + bz])
         if free > 0:
-            skip = min(
-                leave_blocks(px, d[n, 0], inverse[n, 0], bx, free), leave_blocks(py, d[n, 1], inverse[n, 1], by, free)
-            )
+            skip = leave_blocks(px, d[n, 0], inverse[n, 0], bx, free)
+            skip = min(skip, leave_blocks(py, d[n, 1], inverse[n, 1], by, free))
             skip = min(skip, leave_blocks(pz, d[n, 2], inverse[n, 2], bz, free))
             k = max(k + 1, int(np.ceil((t + skip) / step - _HALF)))
             continue
@@ -74,31 +74,19 @@ def next_occupied(pack, a, o, d, inverse, n, k, last, step):
 
 
 @numba.njit(**HELPER)
-def encode_direction(x, y, z, row, at, out) -> None:
-    """Positional encoding of a unit vector: `osfcore.fields.osf.encoding`, into out[row, at:]."""
-    values = x, y, z
-    for c in range(3):
-        s, co = np.sin(values[c]), np.cos(values[c])
-        out[row, at + c] = values[c]
-        for octave in range(DIRECTION_OCTAVES):
-            out[row, at + 3 + 3 * octave + c] = s
-            out[row, at + 3 + 3 * DIRECTION_OCTAVES + 3 * octave + c] = co
-            s, co = _TWO * s * co, co * co - s * s
-
-
-@numba.njit(**HELPER)
-def _encode_place(value, c, out) -> None:
+def _encode(value, c, octaves, out, at) -> None:
+    """Write component c of a positional encoding (`osfcore.fields.osf.encoding`) that begins at out[at]."""
     s, co = np.sin(value), np.cos(value)
-    out[c] = value
-    for octave in range(POSITION_OCTAVES):
-        out[3 + 3 * octave + c] = s
-        out[3 + 3 * POSITION_OCTAVES + 3 * octave + c] = co
+    out[at + c] = value
+    for octave in range(octaves):
+        out[at + 3 + 3 * octave + c] = s
+        out[at + 3 + 3 * octaves + 3 * octave + c] = co
         s, co = _TWO * s * co, co * co - s * s
 
 
 @numba.njit(**HELPER)
 def density_at(pack, a, px, py, pz, place, h1, h2, n):
-    """Density at a point, and where the parameters of its network begin (-1: no network, no density).
+    """Return the density at a point, and where the parameters of its network begin (-1: no network, no density).
 
     Args:
         pack, a: fields, and which one.
@@ -118,9 +106,9 @@ def density_at(pack, a, px, py, pz, place, h1, h2, n):
     number = pack.cells[pack.starts[a, 2] + (i * cy + j) * cz + k]
     if number < 0:
         return _ZERO, -1
-    _encode_place(_TWO * (qx - np.float32(i)) - _ONE, 0, place)
-    _encode_place(_TWO * (qy - np.float32(j)) - _ONE, 1, place)
-    _encode_place(_TWO * (qz - np.float32(k)) - _ONE, 2, place)
+    _encode(_TWO * (qx - np.float32(i)) - _ONE, 0, POSITION_OCTAVES, place, 0)
+    _encode(_TWO * (qy - np.float32(j)) - _ONE, 1, POSITION_OCTAVES, place, 0)
+    _encode(_TWO * (qz - np.float32(k)) - _ONE, 2, POSITION_OCTAVES, place, 0)
     flat, width = pack.networks, pack.width
     begin = pack.starts[a, 3] + np.int64(number) * pack.parameters
     at = begin
@@ -150,12 +138,12 @@ def density_at(pack, a, px, py, pz, place, h1, h2, n):
 
 @numba.njit(**HELPER)
 def transfer_at(pack, begin, h2, n, directions, h1, h3, out) -> None:
-    """Rho of the network that begins at `begin`, from its second hidden layer, into out[0:3].
+    """Write rho of the network that begins at `begin` into out[0:3], from its second hidden layer.
 
     Args:
         pack, begin: as from `density_at`.
         h2, n: its row.
-        directions: row n holds the encoded light and view.
+        directions: the encoded light and view of one object after another.
         h1, h3: memory.
         out: result.
     """
@@ -177,7 +165,7 @@ def transfer_at(pack, begin, h2, n, directions, h1, h3, out) -> None:
         for u in range(width):
             h3[u] += value * flat[row + u]
     for m in range(DIRECTION_INPUTS):
-        value, row = directions[n, m], at + (width + m) * width
+        value, row = directions[n * DIRECTION_INPUTS + m], at + (width + m) * width
         for u in range(width):
             h3[u] += value * flat[row + u]
     at = bias + width
@@ -196,7 +184,7 @@ def transfer_at(pack, begin, h2, n, directions, h1, h3, out) -> None:
 # Fields of tiny networks laid end to end in flat arrays, as compiled code likes them.
 
 
-class PackedTiny(NamedTuple):
+class PackedTiny(namedtuple("PackedTiny", "solid macro cells networks starts shapes scales reach width parameters")):
     """F fields. `starts` says where each one begins in the flat arrays.
 
     Attributes:
@@ -212,17 +200,6 @@ class PackedTiny(NamedTuple):
         parameters: of one network.
     """
 
-    solid: np.ndarray
-    macro: np.ndarray
-    cells: np.ndarray
-    networks: np.ndarray
-    starts: np.ndarray
-    shapes: np.ndarray
-    scales: np.ndarray
-    reach: np.ndarray
-    width: int
-    parameters: int
-
 
 def pack(fields: Sequence[TinyField]) -> PackedTiny:
     """Lay fields end to end.
@@ -233,35 +210,25 @@ def pack(fields: Sequence[TinyField]) -> PackedTiny:
     widths = {field.width for field in fields}
     if len(widths) != 1:
         raise InvalidInput("widths of the fields' networks", sorted(widths), "the same for all fields of a scene")
-    solids = [_solid_voxels(field.occupied) for field in fields]
+    # a voxel is solid if one of its corners is occupied
+    solids = [ndimage.maximum_filter(f.occupied.astype(np.uint8), size=2, origin=-1)[:-1, :-1, :-1] for f in fields]
     parts = [
-        (solid.ravel(), field.macro.ravel(), field.cells.ravel(), field.networks.ravel())
+        [array.ravel() for array in (solid, field.macro, field.cells, field.networks)]
         for solid, field in zip(solids, fields, strict=True)
     ]
     starts = np.zeros((len(fields), 4), np.int64)
     starts[1:] = np.cumsum([[len(array) for array in part] for part in parts], axis=0)[:-1]
-    solid, macro, cells, networks = (np.concatenate([part[i] for part in parts]) for i in range(4))
-    shapes = [
-        [*voxels.shape, *field.macro.shape, *field.cells.shape] for voxels, field in zip(solids, fields, strict=True)
-    ]
+    shapes = [[*solid.shape, *f.macro.shape, *f.cells.shape] for solid, f in zip(solids, fields, strict=True)]
     reach = [np.stack([f.extent[0] - f.voxel, f.extent[1] + f.voxel]).clip(*f.box).reshape(-1) for f in fields]
     return PackedTiny(
-        solid,
-        macro,
-        cells,
-        networks,
-        starts,
-        np.array(shapes, np.int64),
-        np.array([[*f.origin, f.voxel, f.density_scale] for f in fields], np.float32),
-        np.array(reach, np.float32),
-        fields[0].width,
-        fields[0].networks.shape[1],
+        *(np.concatenate(arrays) for arrays in zip(*parts, strict=True)),
+        starts=starts,
+        shapes=np.array(shapes, np.int64),
+        scales=np.array([[*f.origin, f.voxel, f.density_scale] for f in fields], np.float32),
+        reach=np.array(reach, np.float32),
+        width=fields[0].width,
+        parameters=fields[0].networks.shape[1],
     )
-
-
-def _solid_voxels(occupied: Bool[np.ndarray, "nx ny nz"]) -> UInt8[np.ndarray, "vx vy vz"]:
-    """Voxels that have an occupied corner."""
-    return ndimage.maximum_filter(occupied.astype(np.uint8), size=2, origin=-1)[:-1, :-1, :-1].copy()
 
 
 # Shadow mapping (Williams 1978): each object's first surface as its distant light sees it.
@@ -277,7 +244,7 @@ _OPAQUE = np.float32(0.5)
 _BIAS_VOXELS = np.float32(2)
 
 
-class ShadowMaps(NamedTuple):
+class ShadowMaps(namedtuple("ShadowMaps", "surface axes centre radius bias map_of")):
     """M maps, and which of them each object of each scene has.
 
     Attributes:
@@ -288,13 +255,6 @@ class ShadowMaps(NamedTuple):
         bias: M, by which a point must lie behind the surface [m].
         map_of: B x N.
     """
-
-    surface: np.ndarray
-    axes: np.ndarray
-    centre: np.ndarray
-    radius: np.ndarray
-    bias: np.ndarray
-    map_of: np.ndarray
 
 
 def shadow_maps(
@@ -351,9 +311,8 @@ def render_surfaces(pack, which, axes, centre, radius, surface) -> None:
             left, k = _ONE, next_inside(pack, a, o, d, inverse, 0, last, voxel)
             while k <= last:
                 t = (np.float32(k) + _HALF) * voxel
-                sigma, begin = density_at(
-                    pack, a, o[0, 0] + t * d[0, 0], o[0, 1] + t * d[0, 1], o[0, 2] + t * d[0, 2], place, h1, h2, 0
-                )
+                x, y, z = o[0, 0] + t * d[0, 0], o[0, 1] + t * d[0, 1], o[0, 2] + t * d[0, 2]
+                sigma, begin = density_at(pack, a, x, y, z, place, h1, h2, 0)
                 left *= np.exp(-sigma * voxel)
                 if left < _OPAQUE:
                     surface[m, row, column] = radius[m] - t
@@ -363,7 +322,7 @@ def render_surfaces(pack, which, axes, centre, radius, surface) -> None:
 
 @numba.njit(**HELPER)
 def next_inside(pack, a, o, d, inverse, k, last, step):
-    """As `next_occupied` for row 0, for rays that begin outside the grid."""
+    """Return what `next_occupied` does for row 0, for rays that begin outside the grid."""
     t0, t1 = _ZERO, np.float32(1e9)
     for c in range(3):
         low, high = -o[0, c] * inverse[0, c], (np.float32(pack.shapes[a, c]) - o[0, c]) * inverse[0, c]
@@ -378,10 +337,10 @@ def next_inside(pack, a, o, d, inverse, k, last, step):
 
 @numba.njit(**HELPER)
 def light_reaches(scene, maps, b, skip, x, y, z):
-    """1 if the light reaches a point of the world past all objects but one and the pusher, else 0.
+    """Return 1 if the light reaches a point of the world past all objects but one and the pusher, else 0.
 
     Args:
-        scene, maps: of `kernels.render_batch`.
+        scene, maps: of `render_batch`.
         b, skip: scene, and the object that does not shade the point, or -1.
         x, y, z: the point [m].
     """
@@ -415,7 +374,7 @@ def light_reaches(scene, maps, b, skip, x, y, z):
 
 @numba.njit(**HELPER)
 def pusher_distance(scene, b, ox, oy, oz, dx, dy, dz):
-    """Distance along a ray to the pusher, an upright cylinder, and whether it meets a cap; very far if it misses."""
+    """Return the distance along a ray to the pusher, a cylinder, and whether it meets a cap; very far if it misses."""
     far = np.float32(1e9)
     x, y, z = ox - scene.pusher[b, 0], oy - scene.pusher[b, 1], oz - scene.pusher[b, 2]
     half, radius = np.float32(PUSHER_HEIGHT_M / 2), np.float32(PUSHER_RADIUS_M)
@@ -446,7 +405,7 @@ MOST_OBJECTS = 24
 _RED, _GREEN, _BLUE = (np.float32(value) for value in PUSHER_ALBEDO)
 
 
-class Scene(NamedTuple):
+class Scene(namedtuple("Scene", "rotations positions lights local_lights kept pusher has_pusher")):
     """Where everything is.
 
     Attributes:
@@ -459,41 +418,18 @@ class Scene(NamedTuple):
         has_pusher: whether there is one.
     """
 
-    rotations: np.ndarray
-    positions: np.ndarray
-    lights: np.ndarray
-    local_lights: np.ndarray
-    kept: np.ndarray
-    pusher: np.ndarray
-    has_pusher: bool
 
-
-class _Work(NamedTuple):
-    """What one thread writes on; one row for each object."""
-
-    o: np.ndarray
-    d: np.ndarray
-    inverse: np.ndarray
-    directions: np.ndarray
-    is_encoded: np.ndarray
-    h2: np.ndarray
-    sigma: np.ndarray
-    begin: np.ndarray
-    ks: np.ndarray
-    lasts: np.ndarray
-    place: np.ndarray
-    h1: np.ndarray
-    h3: np.ndarray
-    rho: np.ndarray
-    result: np.ndarray
-    total: np.ndarray
+class _Work(
+    namedtuple("_Work", "o d inverse directions is_encoded h2 sigma begin ks lasts place h1 h3 rho result total")
+):
+    """What one thread writes on; most of it has a row for each object."""
 
 
 @numba.njit(error_model="numpy")
 def _workspace():
     n, f = MOST_OBJECTS, np.float32
     return _Work(
-        np.empty((n, 3), f), np.empty((n, 3), f), np.empty((n, 3), f), np.empty((n, DIRECTION_INPUTS), f),
+        np.empty((n, 3), f), np.empty((n, 3), f), np.empty((n, 3), f), np.empty(n * DIRECTION_INPUTS, f),
         np.zeros(n, np.bool_), np.empty((n, MOST_WIDTH), f), np.empty(n, f), np.empty(n, np.int64),
         np.empty(n, np.int64), np.empty(n, np.int64), np.empty(POSITION_INPUTS, f), np.empty(MOST_WIDTH, f),
         np.empty(MOST_WIDTH, f), np.empty(3, f), np.empty(5 + n, f), np.empty(5 + n, f),
@@ -502,7 +438,7 @@ def _workspace():
 
 @numba.njit(**HELPER)
 def _start_ray(pack, fields, scene, cameras, b, view, dx, dy, dz, boxes, row, column, far, step, work) -> None:
-    """The ray in each object's voxel coordinates, and its first occupied sample there; none where its box is missed."""
+    """Find the ray in each object's voxel coordinates and its first occupied sample; none where its box is missed."""
     for n in range(len(fields)):
         work.ks[n], work.lasts[n], work.is_encoded[n] = 0, -1, False
         if not (boxes[b, view, n, 0] <= column < boxes[b, view, n, 1]):
@@ -516,11 +452,8 @@ def _start_ray(pack, fields, scene, cameras, b, view, dx, dy, dz, boxes, row, co
         y = cameras[view, 1] - scene.positions[b, n, 1]
         z = cameras[view, 2] - scene.positions[b, n, 2]
         for c in range(3):
-            r0, r1, r2 = (
-                scene.rotations[b, n, 3 * c],
-                scene.rotations[b, n, 3 * c + 1],
-                scene.rotations[b, n, 3 * c + 2],
-            )
+            r, at = scene.rotations, 3 * c
+            r0, r1, r2 = r[b, n, at], r[b, n, at + 1], r[b, n, at + 2]
             work.o[n, c] = (r0 * x + r1 * y + r2 * z - pack.scales[a, c]) / voxel
             work.d[n, c] = (r0 * dx + r1 * dy + r2 * dz) / voxel
             work.inverse[n, c] = inverted(work.d[n, c])
@@ -538,10 +471,10 @@ def _add_transfer(pack, fields, scene, maps, b, n, x, y, z, weight, work) -> Non
     """Add the radiance of object n at the sample where its density was just evaluated."""
     voxel = pack.scales[fields[n], 3]
     if not work.is_encoded[n]:
-        light = scene.local_lights
-        encode_direction(light[b, n, 0], light[b, n, 1], light[b, n, 2], n, 0, work.directions)
-        encode_direction(work.d[n, 0] * voxel, work.d[n, 1] * voxel, work.d[n, 2] * voxel, n, DIRECTION_INPUTS // 2,
-                         work.directions)  # fmt: skip
+        at = n * DIRECTION_INPUTS
+        for c in range(3):
+            _encode(scene.local_lights[b, n, c], c, DIRECTION_OCTAVES, work.directions, at)
+            _encode(work.d[n, c] * voxel, c, DIRECTION_OCTAVES, work.directions, at + DIRECTION_INPUTS // 2)
         work.is_encoded[n] = True
     transfer_at(pack, work.begin[n], work.h2, n, work.directions, work.h1, work.h3, work.rho)
     visible = light_reaches(scene, maps, b, n, x, y, z)
@@ -594,9 +527,8 @@ def _trace(pack, fields, table, scene, maps, directs, cameras, boxes, rules, b, 
     table_t, pusher_t, is_cap = meet_table(table, cameras, view, dx, dy, dz), FAR, False
     if scene.has_pusher:
         pusher_t, is_cap = pusher_distance(scene, b, ox, oy, oz, dx, dy, dz)
-    _start_ray(
-        pack, fields, scene, cameras, b, view, dx, dy, dz, boxes, row, column, min(table_t, pusher_t), step, work
-    )
+    far = min(table_t, pusher_t)
+    _start_ray(pack, fields, scene, cameras, b, view, dx, dy, dz, boxes, row, column, far, step, work)
     left, coloured = _ONE, _ZERO
     while left > rules[2]:
         k = np.int64(1) << 40
@@ -611,9 +543,9 @@ def _trace(pack, fields, table, scene, maps, directs, cameras, boxes, rules, b, 
             work.sigma[n] = _ZERO
             if work.ks[n] == k and k <= work.lasts[n]:
                 o, d = work.o, work.d
-                work.sigma[n], work.begin[n] = density_at(
-                    pack, fields[n], o[n, 0] + t * d[n, 0], o[n, 1] + t * d[n, 1], o[n, 2] + t * d[n, 2], work.place,
-                    work.h1, work.h2, n)  # fmt: skip
+                px, py, pz = o[n, 0] + t * d[n, 0], o[n, 1] + t * d[n, 1], o[n, 2] + t * d[n, 2]
+                found = density_at(pack, fields[n], px, py, pz, work.place, work.h1, work.h2, n)
+                work.sigma[n], work.begin[n] = found
                 sigma += work.sigma[n]
         weight = left * (_ONE - np.exp(-sigma * step))
         for n in range(count):
@@ -622,9 +554,8 @@ def _trace(pack, fields, table, scene, maps, directs, cameras, boxes, rules, b, 
                     result[5 + n] += weight * work.sigma[n] / sigma
                     if weight > rules[1]:
                         _add_transfer(pack, fields, scene, maps, b, n, x, y, z, weight, work)
-                work.ks[n] = next_occupied(
-                    pack, fields[n], work.o, work.d, work.inverse, n, k + 1, work.lasts[n], step
-                )  # fmt: skip
+                last = work.lasts[n]
+                work.ks[n] = next_occupied(pack, fields[n], work.o, work.d, work.inverse, n, k + 1, last, step)
         result[3] += weight * t
         result[4] += weight
         left -= weight
@@ -639,11 +570,11 @@ def _trace(pack, fields, table, scene, maps, directs, cameras, boxes, rules, b, 
 @numba.njit(**KERNEL)
 def render_batch(pack, fields, table, scene, maps, directs, cameras, boxes, rules, samples, only, rgb, opacity,
                  distance) -> None:  # fmt: skip
-    """Every image of a batch.
+    """Render every image of a batch.
 
     Args:
         pack, fields: packed fields, and that of each of N objects; table: `osfcore.render.renderer.Table`.
-        scene, maps: `Scene` and `shadow_maps.ShadowMaps`.
+        scene, maps: `Scene` and `ShadowMaps`.
         directs, cameras: B x 3 direct light on a white table; V x 12 numbers of `render.types.camera_numbers`.
         boxes: B x V x N x 4, pixels of objects (columns from, to, rows from, to).
         rules: step between samples [m], least weight of a sample that is coloured, transmittance at which a ray ends.
@@ -678,23 +609,14 @@ def render_batch(pack, fields, table, scene, maps, directs, cameras, boxes, rule
 
 # The paper's renderer: scenes of KiloOSFs as published, composed by eq. 3, with shadow maps.
 #
-# It answers as `osfcore.render.renderer.SceneRenderer` does. Readings of what the paper leaves open: table and lamp
+# It is called as `osfcore.render.renderer.SceneRenderer` is. Readings of what the paper leaves open: table and lamp
 # are modelled as in ours; the pusher, a known part of the robot, is an exact cylinder; an object is left out of its
 # own shadow, since rho holds that already; and where the light is blocked, an object keeps the share of its
-# radiance that the table keeps there, for rho alone does not tell its ambient part.
+# radiance that the table keeps there, for rho alone does not separate its ambient part.
 
 
 _FINE_MAP, _COARSE_MAP = 96, 32  # sides of shadow maps [px]
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)), bool)
-
-
-def _check_light_and_pixels(
-    batch: SceneBatch, only: Bool[np.ndarray, "V h w"] | None, shape: tuple[int, int, int]
-) -> None:
-    if batch.spots is not None:
-        raise InvalidInput("light of the published renderer", "a lamp at a finite distance", "a distant one")
-    if only is not None and only.shape != shape:
-        raise InvalidInput("shape of the pixels to look at", only.shape, f"{shape}")
 
 
 class PaperRenderer:
@@ -723,7 +645,7 @@ class PaperRenderer:
         outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
         only: Bool[np.ndarray, "V h w"] | None = None,
     ) -> Rendered:
-        """Images of every scene of a batch from every camera; arguments as for `SceneRenderer.render`.
+        """Render every scene of a batch from every camera; arguments as for `SceneRenderer.render`.
 
         Raises:
             UnknownName: if an object has no field here.
@@ -731,9 +653,10 @@ class PaperRenderer:
                 near lamps.
         """
         size = check_request(self._fields, batch, cameras, outputs)
-        _check_light_and_pixels(batch, only, (len(cameras), *size))
-        from osfcore.render.renderer import plain_table, screen_boxes, z_depth
-
+        if batch.spots is not None:
+            raise InvalidInput("light of the published renderer", "a lamp at a finite distance", "a distant one")
+        if only is not None and only.shape != (len(cameras), *size):
+            raise InvalidInput("shape of the pixels to look at", only.shape, f"{(len(cameras), *size)}")
         packed, numbers = self._packed(batch.names)
         rotations = np.swapaxes(quaternion_to_matrix(batch.quaternions), -1, -2)
         shape, count = (len(batch.lights), len(cameras), *size), len(batch.names)
@@ -764,37 +687,27 @@ class PaperRenderer:
         )
 
     def _packed(self, names: tuple[str, ...]) -> tuple[PackedTiny, np.ndarray]:
-        """The fields of some objects, each packed once, and which of them each object has."""
+        """Return the fields of some objects, each packed once, and which of them each object has."""
         if names not in self._packs:
             different = list(dict.fromkeys(names))
-            numbers = np.array([different.index(name) for name in names], np.int64)
             fields = [self._fields[name] for name in different] or [_nothing()]
-            self._packs[names] = pack(fields), numbers
+            self._packs[names] = pack(fields), np.array([different.index(name) for name in names], np.int64)
         return self._packs[names]
 
-    def _scene(self, batch: SceneBatch, rotations: np.ndarray, directs: np.ndarray):
+    def _scene(self, batch: SceneBatch, rotations: np.ndarray, directs: np.ndarray) -> Scene:
         kept = np.full(len(batch.lights), AMBIENT, np.float32)
         if self._table is not None:
             ambient = float(self._table.ambient.mean())
             kept = (ambient / (ambient + directs.mean(axis=1))).astype(np.float32)
         pusher = np.zeros((len(batch.lights), 3)) if batch.pusher is None else batch.pusher
-
-        def plain(array: np.ndarray) -> np.ndarray:
-            """One memory layout for all batches: any other would be compiled anew."""
-            return np.array(array, np.float32, order="C")
-
-        return Scene(
-            plain(rotations.reshape(*rotations.shape[:2], 9)),
-            plain(batch.positions),
-            plain(batch.lights),
-            plain(np.einsum("bnij,bj->bni", rotations, batch.lights)),
-            kept,
-            plain(pusher),
-            batch.pusher is not None,
-        )
+        matrices = rotations.reshape(*rotations.shape[:2], 9)
+        local_lights = np.einsum("bnij,bj->bni", rotations, batch.lights)
+        arrays = (matrices, batch.positions, batch.lights, local_lights, kept, pusher)
+        # one memory layout for all batches: any other would be compiled anew
+        return Scene(*(np.array(array, np.float32, order="C") for array in arrays), has_pusher=batch.pusher is not None)
 
 
 def _nothing() -> TinyField:
-    """A field that shows nothing: scenes without objects are rendered, too."""
+    """Return a field that shows nothing, for scenes without objects."""
     cells, networks = np.full((1, 1, 1), -1, np.int32), np.zeros((1, network_size(1)), np.float32)
     return TinyField(np.zeros(3, np.float32), 1.0, np.zeros((2, 2, 2), bool), cells, networks, 1)

@@ -38,7 +38,7 @@ class PaperEstimators(Estimators):
     def first_frame(
         self, models: ObjectModels, observation: Observation, rng: np.random.Generator
     ) -> Iterator[EstimateStep]:
-        """Poses and light of the first frame, which has masks."""
+        """Estimate poses and light in the first frame, which has masks."""
         return estimate_first(models, observation, rng, self.cma)
 
     def later_frame(
@@ -49,12 +49,12 @@ class PaperEstimators(Estimators):
         rng: np.random.Generator,
         usual: Float[np.ndarray, "N"] | None = None,
     ) -> Iterator[EstimateStep]:
-        """Poses in a later frame, under the light of the last estimate."""
+        """Estimate poses in a later frame, under the light of the last estimate."""
         return estimate_next(models, observation, expected, rng, self.cma)
 
 
 def load_paper_appearance(names: Iterable[str], fields: FieldLibrary, data_dir: Path | None) -> ObjectModels:
-    """How objects look by their KiloOSFs as published, on the table of ours.
+    """Return how objects look by their KiloOSFs as published, on the table of ours.
 
     Args:
         names: of the objects.
@@ -72,7 +72,7 @@ def load_paper_appearance(names: Iterable[str], fields: FieldLibrary, data_dir: 
 def with_paper_stages(
     models: SceneModels, stages: frozenset[str], fields: FieldLibrary, data_dir: Path | None
 ) -> SceneModels:
-    """Models of which some are the paper's.
+    """Return models of which some are the paper's.
 
     Args:
         models: ours, of a scene's objects.

@@ -9,12 +9,11 @@ of position on them after four actions are kept.
 
 from __future__ import annotations
 
-import math
 import os
 import platform
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -23,14 +22,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from osfcore.dynamics.motion import is_on_table
-from osfcore.dynamics.train import is_for_validation
-from osfcore.errors import InvalidInput, check_ranges, check_seed
-from osfcore.fields.devices import pick_device
-from osfcore.io.checkpoint import resume_from, write_checkpoint
-from osfcore.io.files import write_atomically, write_json
-from osfcore.io.output_paths import check_weights_place
-from osfcore.io.push_file import PushEpisode, read_sound_pushes
+from osfcore.dynamics.train import (
+    MEASURED_WINDOW,
+    MOVED_M,
+    MOVED_RAD,
+    UNROLLED,
+    PushTraining,
+    command_of,
+    fingerprint_of,
+    prepare,
+    share_of_rate,
+    split_episodes,
+    window_starts,
+)
+from osfcore.io.push_file import PushEpisode
 from osfcore.paper.dynamics import GraphNetwork, Scenes, network_bytes, squared_error, unroll
 from osfcore.progress import Progress
 
@@ -87,7 +92,7 @@ class Windows(NamedTuple):
 def record(
     episodes: Sequence[PushEpisode], network: GraphNetwork, kappas: Mapping[str, float], length: int
 ) -> Recording:
-    """Episodes as tensors, with the windows in which nothing falls off the table.
+    """Return episodes as tensors, with the windows in which nothing falls off the table.
 
     Args:
         episodes: recorded pushes.
@@ -98,13 +103,6 @@ def record(
     Raises:
         InvalidInput: if the episodes differ in length or number of objects, or hold no such window.
     """
-    sizes = {(len(e.actions), len(e.names)) for e in episodes}
-    if len(sizes) != 1 or min(sizes)[0] < length:
-        raise InvalidInput("steps and objects of the episodes", sorted(sizes), f"equal, with at least {length} steps")
-    starts = np.array([place for n, e in enumerate(episodes) for place in _starts(n, e, length)], int).reshape(-1, 2)
-    if not len(starts):
-        what = f"windows of {length} actions in which all objects stay on the table"
-        raise InvalidInput(what, 0, "at least 1: collect more pushes")
 
     def stacked(name: str) -> Tensor:
         return torch.as_tensor(np.stack([getattr(e, name) for e in episodes]), dtype=torch.float32)
@@ -116,18 +114,13 @@ def record(
         quaternion=stacked("quaternions"),
         pusher=stacked("pusher"),
         action=stacked("actions"),
-        starts=starts,
+        starts=window_starts(episodes, length),
         length=length,
     )
 
 
-def _starts(number: int, episode: PushEpisode, length: int) -> list[tuple[int, int]]:
-    safe = is_on_table(episode)
-    return [(number, at) for at in range(len(safe) - length) if safe[at : at + length + 1].all()]
-
-
 def windows(recording: Recording, chosen: Int[np.ndarray, "B"], device: torch.device | str = "cpu") -> Windows:
-    """Some windows of a recording.
+    """Return some windows of a recording.
 
     Args:
         recording: that holds them.
@@ -136,10 +129,10 @@ def windows(recording: Recording, chosen: Int[np.ndarray, "B"], device: torch.de
     """
     episode, first = (torch.as_tensor(column) for column in recording.starts[chosen].T)
     rows, times = episode[:, None], first[:, None] + torch.arange(recording.length + 1)
-    position, quaternion = recording.position[rows, times].to(device), recording.quaternion[rows, times].to(device)
-    pusher = recording.pusher[rows, times].to(device)
-    start = Scenes(position[:, 0], quaternion[:, 0], pusher[:, 0])
+    places = (recording.position, recording.quaternion, recording.pusher)
+    position, quaternion, pusher = (part[rows, times].to(device) for part in places)
     number, kappa = recording.number[episode].to(device), recording.kappa[episode].to(device)
+    start = Scenes(position[:, 0], quaternion[:, 0], pusher[:, 0])
     action = recording.action[rows, times[:, :-1]].to(device)
     return Windows(number, kappa, start, action, pusher, position[:, 1:], quaternion[:, 1:])
 
@@ -147,8 +140,6 @@ def windows(recording: Recording, chosen: Int[np.ndarray, "B"], device: torch.de
 # Errors of the paper's network on held-out windows, as ours are measured, beside those of predicting no motion.
 
 
-MEASURED_WINDOW = 4  # actions
-_MOVED_M, _MOVED_RAD = 0.01, math.radians(5)  # what counts as truly moved within a window
 _TOGETHER = 512  # windows
 
 
@@ -175,7 +166,7 @@ class Validation:
 
 @torch.inference_mode()
 def validate(network: GraphNetwork, recording: Recording, device: torch.device | str = "cpu") -> Validation:
-    """Roll out all held-out windows.
+    """Return the errors on all held-out windows.
 
     Args:
         network: to measure, on `device`.
@@ -183,37 +174,31 @@ def validate(network: GraphNetwork, recording: Recording, device: torch.device |
         device: that computes.
     """
     count = len(recording.starts)
-    parts = [_errors(network, windows(recording, rows, device)) for rows in _chunks(count)]
+    chunks = np.array_split(np.arange(count), range(_TOGETHER, count, _TOGETHER))
+    parts = [_errors(network, windows(recording, rows, device)) for rows in chunks]
     shift, turn, way, turned = torch.cat(parts, dim=1)
-    moved = (way > _MOVED_M) | (turned > _MOVED_RAD)
+    moved = (way > MOVED_M) | (turned > MOVED_RAD)
     chosen = moved if bool(moved.any()) else torch.ones_like(moved)
     shift, turn, way, turned = (part[chosen] for part in (1e3 * shift, turn.rad2deg(), 1e3 * way, turned.rad2deg()))
     medians = [float(part.median()) for part in (shift, turn, way, turned)]
     return Validation(int(moved.sum()), medians[0], medians[1], float(shift.mean()), medians[2], medians[3])
 
 
-def _chunks(count: int) -> list[np.ndarray]:
-    return np.array_split(np.arange(count), range(_TOGETHER, count, _TOGETHER))
-
-
 def _errors(network: GraphNetwork, pieces: Windows) -> Float[Tensor, "four B N"]:
-    """How far and by what angle predictions end from the truth, and beginnings [m, rad]."""
+    """Return how far and by what angle predictions end from the truth, then beginnings likewise [m, rad]."""
     *_, end = unroll(network, pieces.number, pieces.kappa, pieces.start, pieces.action, pieces.pusher)
-    differences = [_difference(scenes, pieces) for scenes in (end, pieces.start)]
-    return torch.cat(differences)
+    errors = []
+    for scenes in (end, pieces.start):
+        cosine = (scenes.quaternion * pieces.quaternion[:, -1]).sum(dim=-1).abs().double().clamp(max=1)
+        errors += [(scenes.position - pieces.position[:, -1]).norm(dim=-1), 2 * torch.acos(cosine).float()]
+    return torch.stack(errors)
 
 
-def _difference(scenes: Scenes, pieces: Windows) -> Float[Tensor, "two B N"]:
-    cosine = (scenes.quaternion * pieces.quaternion[:, -1]).sum(dim=-1).abs().double().clamp(max=1)
-    return torch.stack([(scenes.position - pieces.position[:, -1]).norm(dim=-1), 2 * torch.acos(cosine).float()])
+# The training run.
 
 
-UNROLLED = 3  # actions (paper: up to three future steps)
-_WARM_UP = 100
 _DECAY = 0.5  # of weights
-_LAST_RATE = 0.01  # of the first one
-_REPORT_EVERY, _MEASURE_EVERY = 20, 500
-_OWN_METRICS = ("validation_mm_4", "validation_windows")
+_MEASURE_EVERY = 500  # iterations
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,13 +230,8 @@ class TrainPaperDynamics:
     @property
     def command(self) -> str:
         """How to do it again."""
-        parts = ["osf", "train", "dynamics", "--method", "paper", "--data", *(path.name for path in self.data)]
-        parts += ["--out", self.out.name]
-        default = TrainPaperDynamics(self.data, self.out)
-        for name in ("iterations", "batch", "hidden", "rate", "patience", "seed"):
-            if getattr(self, name) != getattr(default, name):
-                parts += [f"--{name}", str(getattr(self, name))]
-        return shlex.join(parts)
+        options = ("iterations", "batch", "hidden", "rate", "patience", "seed")
+        return shlex.join(command_of(self, options, "--method", "paper"))
 
 
 def train_paper_dynamics(config: TrainPaperDynamics, kappas: Mapping[str, float]) -> Iterator[Progress]:
@@ -266,68 +246,37 @@ def train_paper_dynamics(config: TrainPaperDynamics, kappas: Mapping[str, float]
         CorruptFile: if a push file cannot be read, or the checkpoint of a killed run cannot be gone on from.
         CannotWrite: if the output cannot be written, which is tried first.
     """
-    _check(config)
-    device = pick_device(config.device)
-    check_weights_place(config.out, _OWN_METRICS)
+    device = prepare(config)
     yield Progress(0, config.iterations, "Reading the pushes")
-    run = _Run(config, kappas, device)
-    run.resume()
-    while not run.is_over:
-        note = run.iterate()
-        if run.done % _MEASURE_EVERY == 0 or run.done == config.iterations:
-            run.measure()
-            run.save()
-        if run.done % _REPORT_EVERY == 0:
-            yield Progress(run.done, config.iterations, note)
-    run.finish()
-    yield Progress(config.iterations, config.iterations, run.note)
+    yield from _Run(config, kappas, device).run()
 
 
-def _check(config: TrainPaperDynamics) -> None:
-    check_seed(config.seed)
-    check_ranges(
-        ("number of iterations", config.iterations, 1, 10_000_000),
-        ("batch", config.batch, 1, 100_000),
-        ("width of the network", config.hidden, 1, 1024),
-        ("patience", config.patience, 1, 1_000_000),
-        ("rate of learning", config.rate, 1e-9, 1),
-    )
-
-
-class _Run:
-    """The state of a training run."""
+class _Run(PushTraining):
+    measurement, score = Validation, "mean_mm_4"
 
     def __init__(self, config: TrainPaperDynamics, kappas: Mapping[str, float], device: torch.device) -> None:
         self._config, self._device = config, device
-        learned, kept = _episodes(config, frozenset(kappas))
-        self._used = len(learned)
+        # unlike in the training of our network, pairs of objects are not held out
+        learned, kept = split_episodes(config.data, kappas, lambda _: True, "collect more")
+        self._episodes = len(learned)
         names = sorted({name for episode in learned for name in episode.names})
         torch.manual_seed(config.seed)
-        self._rng = np.random.default_rng(config.seed)
         self._network = GraphNetwork(names, config.hidden).to(device)
         self._optimiser = torch.optim.AdamW(self._network.parameters(), lr=config.rate, weight_decay=_DECAY)
         self._recording = record(learned, self._network, kappas, UNROLLED)
         self._validation = record(kept, self._network, kappas, MEASURED_WINDOW)
-        self._best: dict[str, Tensor] = {}
-        self.best: Validation | None = None
-        self.done = self.fruitless = 0
+        super().__init__(
+            self._network, {"network": self._network, "optimiser": self._optimiser},
+            repr(("paper", fingerprint_of(config), self._episodes, len(self._recording.starts))), out=config.out,
+            total=config.iterations, patience=config.patience, seed=config.seed,
+        )  # fmt: skip
 
-    @property
-    def is_over(self) -> bool:
-        """Whether there is nothing left to do, or to hope for."""
-        return self.done >= self._config.iterations or self.fruitless >= self._config.patience
-
-    @property
-    def note(self) -> str:
-        """How good it is, for a person."""
-        if self.best is None:
-            return "not measured yet"
-        return f"held out: {self.best.mm_4:.1f} mm, {self.best.deg_4:.1f} deg after 4 steps"
+    def is_due(self) -> bool:
+        return self.done % _MEASURE_EVERY == 0 or self.done == self.total
 
     def iterate(self) -> str:
-        """One step of descent."""
         for group in self._optimiser.param_groups:
-            group["lr"] = self._config.rate * self._share_of_rate()
+            group["lr"] = self._config.rate * share_of_rate(self.done, self.total)
         loss = self._loss()
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -336,93 +285,22 @@ class _Run:
         return f"loss {float(loss.detach()):.4f}; {self.note}"
 
     def _loss(self) -> Tensor:
-        """Mean over three actions of the error that is summed across objects."""
-        pieces = windows(
-            self._recording, self._rng.integers(len(self._recording.starts), size=self._config.batch), self._device
-        )
+        """Return the mean over three actions of the error that is summed across objects."""
+        chosen = self.rng.integers(len(self._recording.starts), size=self._config.batch)
+        pieces = windows(self._recording, chosen, self._device)
         scenes = unroll(self._network, pieces.number, pieces.kappa, pieces.start, pieces.action, pieces.pusher)
         losses = [squared_error(s, pieces.position[:, t], pieces.quaternion[:, t]) for t, s in enumerate(scenes)]
         return torch.stack(losses).mean()
 
-    def _share_of_rate(self) -> float:
-        falling = _LAST_RATE + (1 - _LAST_RATE) * (1 + math.cos(math.pi * self.done / self._config.iterations)) / 2
-        return min(1, (self.done + 1) / _WARM_UP) * falling
+    def measured(self) -> tuple[Validation, GraphNetwork]:
+        return validate(self._network, self._validation, self._device), self._network
 
-    def measure(self) -> None:
-        """Keep the weights if they are the best so far."""
-        result = validate(self._network, self._validation, self._device)
-        if self.best is None or result.mean_mm_4 < self.best.mean_mm_4:
-            self.best, self.fruitless = result, 0
-            self._best = {name: value.detach().cpu().clone() for name, value in self._network.state_dict().items()}
-        else:
-            self.fruitless += 1
-
-    @property
-    def _checkpoint(self) -> Path:
-        return self._config.out.with_suffix(".checkpoint")
-
-    def _fingerprint(self) -> str:
-        settings = {**asdict(self._config), "data": [path.name for path in self._config.data], "out": "", "device": ""}
-        return repr(("paper", settings, self._used, len(self._recording.starts)))
-
-    def save(self) -> None:
-        """Everything that is needed to go on."""
-        content: dict[str, Any] = {
-            "network": self._network.state_dict(),
-            "optimiser": self._optimiser.state_dict(),
-            "best": self._best,
-            "validation": asdict(self.best) if self.best else None,
-            "numbers": [self.done, self.fruitless],
-            "rng": self._rng.bit_generator.state,
-        }
-        write_checkpoint(self._checkpoint, self._fingerprint(), content)
-
-    def resume(self) -> None:
-        """Go on from the checkpoint of the same run, if there is one."""
-        resume_from(self._checkpoint, self._fingerprint(), self._restore)
-
-    def _restore(self, content: dict[str, Any]) -> None:
-        self._network.load_state_dict(content["network"])
-        self._optimiser.load_state_dict(content["optimiser"])
-        self._best = content["best"]
-        self.best = Validation(**content["validation"]) if content["validation"] else None
-        self.done, self.fruitless = content["numbers"]
-        self._rng.bit_generator.state = content["rng"]
-
-    def finish(self) -> None:
-        """Write the best weights and what is known of them."""
-        assert self.best is not None
-        self._network.load_state_dict(self._best)
-        data = network_bytes(self._network)
-        write_atomically(self._config.out, data)
-        metrics = {f"validation_{name}": round(value, 3) for name, value in asdict(self.best).items()}
-        own = {
-            "iterations": self.done,
-            "seed": self._config.seed,
-            "device": str(self._device),
+    def described(self) -> tuple[bytes, dict[str, Any]]:
+        config, data = self._config, network_bytes(self._network)
+        return data, {
+            "iterations": self.done, "seed": config.seed, "device": str(self._device),
             "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-            "threads": torch.get_num_threads(),
-            "bytes": len(data),
-            "episodes": self._used,
-            "windows": len(self._recording.starts),
-            "data": [path.name for path in self._config.data],
-            "command": self._config.command,
-        }
-        write_json(self._config.out.with_suffix(".json"), {**metrics, **own})
-        self._checkpoint.unlink(missing_ok=True)
-
-
-def _episodes(config: TrainPaperDynamics, known: frozenset[str]) -> tuple[list[PushEpisode], list[PushEpisode]]:
-    """What is learned from, and what is kept to stop by. Unlike ours, pairs of objects are not held out."""
-    parts: tuple[list[PushEpisode], list[PushEpisode]] = [], []
-    unknown = set[str]()
-    for path in config.data:
-        for number, episode in enumerate(read_sound_pushes(path)):
-            unknown |= set(episode.names) - known
-            if set(episode.names) <= known:
-                parts[is_for_validation(number)].append(episode)
-    if not all(parts):
-        what = "episodes to validate on" if parts[0] else "episodes to learn from"
-        lacking = f" (objects without a field: {', '.join(sorted(unknown))})" if unknown else ""
-        raise InvalidInput(what, f"0{lacking}", "at least 1: collect more")
-    return parts
+            "threads": torch.get_num_threads(), "bytes": len(data),
+            "episodes": self._episodes, "windows": len(self._recording.starts),
+            "data": [path.name for path in config.data], "command": config.command,
+        }  # fmt: skip

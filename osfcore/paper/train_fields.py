@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from osfcore.errors import CorruptFile, InvalidInput, check_seed
+from osfcore.errors import CorruptFile, check_seed
 from osfcore.fields.devices import pick_device
 from osfcore.fields.kiloosf import FLOOR_G, KiloOSF
 from osfcore.fields.osf import OSF, OSFSize
@@ -24,16 +24,16 @@ from osfcore.fields.rays import RayBatch, RaySource
 from osfcore.fields.train_kiloosf import FieldStep
 from osfcore.fields.train_osf import (
     Checkpoint,
-    NetworkHoldout,
+    Holdout,
     NetworkStage,
     Rates,
     TeacherRecipe,
     baked_g,
+    check_budget,
     corners,
+    descend,
     first_teacher,
-    read_checkpoint,
     restored_teacher,
-    write_checkpoint,
 )
 from osfcore.fields.visual_hull import silhouette_box
 from osfcore.io.checkpoint import going_on_from
@@ -55,76 +55,114 @@ RATES = Rates(3e-3, 1e-3)
 _POINTS = 8192
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class TinyStart:
+    """Where tiny networks begin.
+
+    Attributes:
+        field: with first weights.
+        proposal: the teacher's density, which decides where samples lie along a ray.
+        hull: corners of the proposals' grid outside which the object cannot be.
+    """
+
+    field: TinyField
+    proposal: KiloOSF
+    hull: Bool[np.ndarray, "nx ny nz"]
+
+    def state(self) -> dict[str, Tensor]:
+        """Return what a checkpoint needs besides the proposals."""
+        arrays = {name: getattr(self.field, name) for name in ("cells", "occupied", "networks")}
+        return {name: torch.from_numpy(array) for name, array in {"hull": self.hull, **arrays}.items()}
+
+    @staticmethod
+    def restored(proposal: KiloOSF, state: dict[str, Any], width: int) -> TinyStart:
+        """Take it over from a checkpoint."""
+        occupied, cells, networks, hull = (state[name].numpy() for name in ("occupied", "cells", "networks", "hull"))
+        return TinyStart(TinyField(proposal.origin, proposal.voxel, occupied, cells, networks, width), proposal, hull)
+
+
 class TinyDistillation:
     """Tiny networks while they learn from a teacher.
 
     Args:
-        field: where the networks begin.
+        start: where the networks begin.
         teacher: a trained OSF of the same object.
         device: that computes.
     """
 
-    def __init__(self, field: TinyField, teacher: OSF, device: torch.device) -> None:
-        self.teacher, self.grid = teacher, field
-        self.query = TinyQuery(field, device=device)
+    def __init__(self, start: TinyStart, teacher: OSF, device: torch.device) -> None:
+        self.start, self.teacher = start, teacher
+        self.query = TinyQuery(start.field, device=device)
         self._optimiser = torch.optim.Adam(self.query.parameters(), eps=1e-12)
-        self._corners = np.argwhere(field.occupied).astype(np.float32)
+        self._corners = np.argwhere(start.field.occupied).astype(np.float32)
 
     def step(self, rays: RayBatch, share: float, rng: np.random.Generator, _generator: torch.Generator) -> float:
-        """One step of descent on random points.
+        """Take one step of descent on random points and return the loss.
 
         Args:
             rays: views and lights are drawn from theirs.
             share: of the stage that is done, in [0, 1].
             rng: draws the points.
-
-        Returns:
-            The loss.
+            _generator: not needed here.
         """
         for group in self._optimiser.param_groups:
             group["lr"] = RATES.at(share)
         corner = self._corners[rng.integers(len(self._corners), size=_POINTS)]
         jitter = rng.uniform(-0.5, 0.5, corner.shape).astype(np.float32)
-        points = self.grid.origin + np.float32(self.grid.voxel) * (corner + jitter)
+        points = self.start.field.origin + np.float32(self.start.field.voxel) * (corner + jitter)
         ray = rng.integers(len(rays.lights), size=_POINTS)
-        loss = self.loss(*(torch.as_tensor(a, device=self.query.device)
-                           for a in (points, rays.lights[ray], rays.directions[ray])))  # fmt: skip
-        self._optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        self._optimiser.step()
-        return float(loss.detach())
+        drawn = (points, rays.lights[ray], rays.directions[ray])
+        return descend(self._optimiser, self.loss(*(torch.as_tensor(a, device=self.query.device) for a in drawn)))
 
     def loss(
         self, x: Float[Tensor, "S 3"], light: Float[Tensor, "S 3"], view: Float[Tensor, "S 3"]
     ) -> Float[Tensor, ""]:
-        """Squared error of a voxel's opacity, and of rho where the teacher is opaque.
+        """Return the squared error of a voxel's opacity, and of rho where the teacher is opaque.
 
         Args:
             x: points in the object's frame [m].
             light: unit vectors toward the light, in the object's frame.
             view: unit vectors from the camera into the scene, in the object's frame.
         """
+        voxel = self.start.field.voxel
         with torch.no_grad():
             right = self.teacher(x, light, view)
-            alpha = -torch.expm1(-right.sigma * self.grid.voxel)
+            alpha = -torch.expm1(-right.sigma * voxel)
         mine = self.query(x, light, view)
         error = ((mine.direct - right.ambient - right.direct) ** 2).sum(dim=-1)
-        return (alpha * error + (-torch.expm1(-mine.sigma * self.grid.voxel) - alpha) ** 2).mean()
+        return (alpha * error + (-torch.expm1(-mine.sigma * voxel) - alpha) ** 2).mean()
+
+    def snapshot(self) -> KiloOSF:
+        """Return the teacher's density."""
+        return self.start.proposal
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint needs."""
-        return {"adam": self._optimiser.state_dict(), "student": self.query.state_dict()}
+        """Return what a checkpoint needs besides the proposals."""
+        networks = {"student": self.query.state_dict(), "teacher": self.teacher.state_dict()}
+        return {"adam": self._optimiser.state_dict(), **networks, **self.start.state()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
+        """Go on from a checkpoint; the start and the teacher are given to the constructor."""
         self._optimiser.load_state_dict(state["adam"])
         self.query.load_state_dict(state["student"])
+
+
+class TinyFineTuning(NetworkStage):
+    """Tiny networks while they learn from images."""
+
+    def __init__(self, query: TinyQuery, start: TinyStart, recipe: PaperFieldRecipe) -> None:
+        super().__init__(query, start.proposal, start.hull, rates=recipe.rates, rebake=recipe.teacher.rebake)
+        self.query, self.start = query, start
+
+    def state(self) -> dict[str, Any]:
+        """Return what a checkpoint needs besides the proposals."""
+        return {**super().state(), **self.start.state()}
 
 
 _LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
 _MOST_BYTES = 1_950_000  # of a file's networks
 _METRICS = ("psnr_full", "psnr_mask")
-_WORDS = {"teacher": "Teacher", "distil": "Distillation", "fine": "Fine-tuning"}
+_PHASES = {"teacher": "Teacher", "distil": "Distillation", "fine": "Fine-tuning"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +177,7 @@ class PaperFieldRecipe:
         rates: of fine-tuning.
         teacher_share: of the budget.
         distil_share: likewise.
-        report_s: between two steps that are told [s].
+        report_s: between two steps that are reported [s].
         checkpoint_s: between two checkpoints [s].
     """
 
@@ -192,10 +230,7 @@ def train_paper_field(config: TrainPaperField, recipe: PaperFieldRecipe | None =
         CannotWrite: if the output cannot be written, which is tried first.
     """
     device = pick_device(config.device)
-    if not 0.05 <= config.minutes <= 24 * 60:
-        raise InvalidInput("minutes", config.minutes, "between 0.05 and 1440")
-    if config.iterations is not None and not 10 <= config.iterations <= 10_000_000:
-        raise InvalidInput("iterations", config.iterations, "between 10 and 10,000,000")
+    check_budget(config.minutes, config.iterations)
     check_seed(config.seed)
     check_weights_place(config.out, _METRICS)
     recipe = recipe or PaperFieldRecipe()
@@ -219,55 +254,44 @@ class _Run:
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator(device).manual_seed(config.seed)
         self._clock: dict[str, Any] = {"seconds": 0.0, "steps": 0, "looked_at": 0.0, "psnr": None}
-        self._tiny: TinyField | None = None
-        self._proposal: KiloOSF | None = None
-        self._hull: np.ndarray | None = None
-        end = recipe.teacher_share + recipe.distil_share
-        self._ends = {"teacher": recipe.teacher_share, "distil": end, "fine": 1.0}
+        self._checkpoint_path = config.out.with_suffix(".partial")
+        settings = {**asdict(config), "data": str(config.data.resolve()), "out": str(config.out)}
+        digests = [train.digest(), test.digest()]
+        self._fingerprint = {"settings": settings, "recipe": asdict(recipe), "images": digests}
 
     def steps(self) -> Iterator[FieldStep]:
         yield self._report("Reading the images")
-        saved = read_checkpoint(self._checkpoint_path, self._fingerprint())
+        saved = Checkpoint.read(self._checkpoint_path, self._fingerprint)
         if saved is None:
-            name, learner = self._first()
+            box = silhouette_box(self._train, where=self._config.data)
+            name, learner = "teacher", first_teacher(self._train, box, self._recipe.teacher, self._rng, self._device)
         else:
             with going_on_from(self._checkpoint_path):
-                name, learner = self._resumed(saved)
-        names = list(self._ends)
+                name, learner = saved.stage, self._resumed(saved)
+        names, recipe = list(_PHASES), self._recipe
+        ends = [0.0, recipe.teacher_share, recipe.teacher_share + recipe.distil_share, 1.0]
         for number in range(names.index(name), len(names)):
-            if number > names.index(name):
-                learner = self._next(names[number], learner)
+            if names[number] != name:
+                learner = self._next(learner)
                 self._save(names[number], learner)
-            start = self._ends[names[number - 1]] if number else 0.0
-            yield from self._descend(names[number], learner, start, self._ends[names[number]])
+            yield from self._descend(names[number], learner, ends[number], ends[number + 1])
         yield self._report("Measuring on all held-out images")
+        assert isinstance(learner, TinyFineTuning)
         yield self._finish(learner)
 
-    def _first(self) -> tuple[str, _Learner]:
-        box = silhouette_box(self._train, where=self._config.data)
-        return "teacher", first_teacher(self._train, box, self._recipe.teacher, self._rng, self._device)
-
-    def _next(self, name: str, before: _Learner) -> _Learner:
-        """The learner of a phase, from that of the phase before."""
+    def _next(self, before: _Learner) -> _Learner:
+        """Return the learner of a phase, from that of the phase before."""
         r = self._recipe
-        if isinstance(before, NetworkStage):
-            assert isinstance(before.network, OSF)
-            self._proposal, self._hull = before.snapshot(), before.state()["hull"].numpy()
-            grid, most = self._proposal, _MOST_BYTES // (2 * network_size(r.width))
-            occupied = grid.density > FLOOR_G
-            self._tiny = first_field(grid.origin, grid.voxel, occupied, across=r.across, width=r.width,
-                                     most_networks=most, rng=self._rng)  # fmt: skip
-            return TinyDistillation(self._tiny, before.network, self._device)
-        return self._fine(before.query)
-
-    def _fine(self, query: TinyQuery) -> NetworkStage:
-        assert self._proposal is not None
-        assert self._hull is not None
-        recipe = self._recipe
-        return NetworkStage(query, self._proposal, self._hull, rates=recipe.rates, rebake=recipe.teacher.rebake)
+        if isinstance(before, TinyDistillation):
+            return TinyFineTuning(before.query, before.start, r)
+        assert isinstance(before.network, OSF)
+        grid, most = before.snapshot(), _MOST_BYTES // (2 * network_size(r.width))
+        tiny = first_field(grid.origin, grid.voxel, grid.density > FLOOR_G, across=r.across, width=r.width,
+                           most_networks=most, rng=self._rng)  # fmt: skip
+        return TinyDistillation(TinyStart(tiny, grid, before.state()["hull"].numpy()), before.network, self._device)
 
     def _share(self) -> float:
-        """Of the whole budget that is used up."""
+        """Return the share of the whole budget that is used up."""
         if self._config.iterations is not None:
             return min(1.0, self._clock["steps"] / self._config.iterations)
         return min(1.0, self._clock["seconds"] / (60 * self._config.minutes))
@@ -292,97 +316,69 @@ class _Run:
     def _look(self, name: str, learner: _Learner) -> FieldStep:
         preview = None
         if isinstance(learner, NetworkStage) and self._share() - self._clock["looked_at"] > _LOOK_SHARE:
-            look = NetworkHoldout(self._test, learner.network).glance(learner.snapshot())
+            look = Holdout(self._test, learner.network).glance(learner.snapshot())
             self._clock |= {"looked_at": self._share(), "psnr": (look.psnr_full, look.psnr_mask)}
             preview = look.preview
         psnr = self._clock["psnr"]
         quality = f", {psnr[0]:.1f} dB held out ({psnr[1]:.1f} in the mask)" if psnr else ""
-        return replace(self._report(f"{_WORDS[name]}, step {self._clock['steps']}{quality}"), preview=preview)
+        return replace(self._report(f"{_PHASES[name]}, step {self._clock['steps']}{quality}"), preview=preview)
 
     def _report(self, words: str) -> FieldStep:
         total = self._config.iterations or max(1, round(60 * self._config.minutes))
         full, mask = self._clock["psnr"] or (None, None)
         return FieldStep(Progress(round(self._share() * total), total, words), full, mask, None)
 
-    def _finish(self, learner: _Learner) -> FieldStep:
+    def _finish(self, learner: TinyFineTuning) -> FieldStep:
         """Measure what users will read from the file, and write it."""
-        assert isinstance(learner, NetworkStage)
-        assert isinstance(learner.network, TinyQuery)
-        assert self._tiny is not None
-        grid = learner.snapshot()
+        config, grid = self._config, learner.snapshot()
         occupied = np.zeros(grid.index.shape, bool)
         near = grid.density > FLOOR_G
-        occupied[near] = baked_g(learner.network, corners(grid)[near], grid.voxel) > FLOOR_G
-        data = field_bytes(learner.network.to_field(self._tiny, occupied))
+        occupied[near] = baked_g(learner.query, corners(grid)[near], grid.voxel) > FLOOR_G
+        data = field_bytes(learner.query.to_field(learner.start.field, occupied))
         written = TinyQuery(field_from_bytes(data, "The trained field"), device=self._device)
-        look = NetworkHoldout(self._test, written).everything(grid)
-        metrics = self._metrics(len(data), look.psnr_full, look.psnr_mask, look.images)
-        write_atomically(self._config.out, data)
-        write_json(self._config.out.with_suffix(".json"), metrics)
+        look = Holdout(self._test, written).everything(grid)
+        metrics = {
+            "psnr_full": round(look.psnr_full, 3),
+            "psnr_mask": round(look.psnr_mask, 3),
+            "test_images": look.images,
+            "bytes": len(data),
+            "networks": len(learner.start.field.networks),
+            "minutes": round(self._clock["seconds"] / 60, 3),
+            "iterations": self._clock["steps"],
+            "seed": config.seed,
+            "device": str(self._device),
+            "threads": torch.get_num_threads(),
+            "data": config.data.name,
+            "train_images": len(self._train.cameras),
+            "image_size": list(self._source.image_shape),
+            "recipe": {"name": "paper", **asdict(self._recipe)},
+        }
+        write_atomically(config.out, data)
+        write_json(config.out.with_suffix(".json"), metrics)
         self._checkpoint_path.unlink(missing_ok=True)
         self._clock["psnr"] = look.psnr_full, look.psnr_mask
         words = f"{look.psnr_full:.2f} dB held out, {look.psnr_mask:.2f} dB in the mask, {len(data) / 1e6:.2f} MB"
         return replace(self._report(words), preview=look.preview)
 
-    def _metrics(self, size: int, full: float, mask: float, images: int) -> dict[str, Any]:
-        assert self._tiny is not None
-        return {
-            "psnr_full": round(full, 3),
-            "psnr_mask": round(mask, 3),
-            "test_images": images,
-            "bytes": size,
-            "networks": len(self._tiny.networks),
-            "minutes": round(self._clock["seconds"] / 60, 3),
-            "iterations": self._clock["steps"],
-            "seed": self._config.seed,
-            "device": str(self._device),
-            "threads": torch.get_num_threads(),
-            "data": self._config.data.name,
-            "train_images": len(self._train.cameras),
-            "image_size": list(self._source.image_shape),
-            "recipe": {"name": "paper", **asdict(self._recipe)},
-        }
-
-    @property
-    def _checkpoint_path(self) -> Path:
-        return self._config.out.with_suffix(".partial")
-
-    def _fingerprint(self) -> dict[str, Any]:
-        """What a checkpoint must agree with to be gone on from."""
-        settings = {**asdict(self._config), "data": str(self._config.data.resolve()), "out": str(self._config.out)}
-        digests = [self._train.digest(), self._test.digest()]
-        return {"settings": settings, "recipe": asdict(self._recipe), "images": digests}
-
     def _save(self, name: str, learner: _Learner) -> None:
         random = {"numpy": self._rng.bit_generator.state, "torch": self._generator.get_state()}
-        state = learner.state()
-        proposal = learner.snapshot() if isinstance(learner, NetworkStage) else self._proposal
-        assert proposal is not None
-        if self._tiny is not None:
-            kept = {"cells": self._tiny.cells, "occupied": self._tiny.occupied, "networks": self._tiny.networks}
-            state |= {"hull": torch.from_numpy(self._hull), **{k: torch.from_numpy(v) for k, v in kept.items()}}
-        if isinstance(learner, TinyDistillation):
-            state["teacher"] = learner.teacher.state_dict()
-        write_checkpoint(
-            self._checkpoint_path, Checkpoint(name, proposal, state, dict(self._clock), random), self._fingerprint()
-        )
+        checkpoint = Checkpoint(name, learner.snapshot(), learner.state(), dict(self._clock), random)
+        checkpoint.write(self._checkpoint_path, self._fingerprint)
 
-    def _resumed(self, saved: Checkpoint) -> tuple[str, _Learner]:
-        state, self._clock = saved.optimiser, dict(saved.clock)
+    def _resumed(self, saved: Checkpoint) -> _Learner:
+        state, self._clock, recipe = saved.optimiser, dict(saved.clock), self._recipe
         self._rng.bit_generator.state = saved.random["numpy"]
         self._generator.set_state(saved.random["torch"])
         if saved.stage == "teacher":
-            return saved.stage, restored_teacher(saved.field, state, self._recipe.teacher, self._device)
-        grid, self._proposal, self._hull = saved.field, saved.field, state["hull"].numpy()
-        cells, occupied, networks = (state[name].numpy() for name in ("cells", "occupied", "networks"))
-        self._tiny = TinyField(grid.origin, grid.voxel, occupied, cells, networks, self._recipe.width)
+            return restored_teacher(saved.field, state, recipe.teacher, self._device)
+        start = TinyStart.restored(saved.field, state, recipe.width)
         if saved.stage == "distil":
-            teacher = OSF(grid.box, self._recipe.teacher.size, device=self._device)
+            teacher = OSF(saved.field.box, recipe.teacher.size, device=self._device)
             teacher.load_state_dict(state["teacher"])
-            learner = TinyDistillation(self._tiny, teacher, self._device)
+            learner = TinyDistillation(start, teacher, self._device)
         else:
-            query = TinyQuery(self._tiny, device=self._device)
+            query = TinyQuery(start.field, device=self._device)
             query.load_state_dict(state["network"])
-            learner = self._fine(query)
+            learner = TinyFineTuning(query, start, recipe)
         learner.restore(state)
-        return saved.stage, learner
+        return learner

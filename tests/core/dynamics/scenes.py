@@ -12,7 +12,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, STEP_S
-from osfcore.io.push_file import PushEpisode
+from osfcore.io.push_file import EpisodeFolder, PushEpisode, save_episode
 
 BOX, CAN, GELATIN, APPLE = NAMES = ("003_cracker_box", "005_tomato_soup_can", "009_gelatin_box", "013_apple")
 
@@ -140,3 +140,12 @@ def episode(shapes, state: SceneState, actions, *, substates: bool = True) -> Pu
     return PushEpisode(
         state.names, 0, positions[ends], turned[ends], pusher, actions, moved, **(within if substates else {})
     )
+
+
+def write(path, episodes):
+    """A push file."""
+    with EpisodeFolder(path, {}) as folder:
+        for number, e in enumerate(episodes):
+            save_episode(folder.path(number), e)
+        folder.combine(len(episodes))
+    return path

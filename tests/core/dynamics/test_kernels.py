@@ -78,8 +78,7 @@ def both(net, known, state: SceneState, actions, before: SceneState | None = Non
     return found.positions[:, 1:], by_torch(net, known, state, actions, before).position, state.poses.position
 
 
-@pytest.mark.parametrize("hidden", [16, 32])
-@pytest.mark.parametrize("name", ["one", "several", "hollow"])
+@pytest.mark.parametrize(("name", "hidden"), [("several", 16), ("hollow", 32), ("one", 18)])
 def test_they_are_the_same(known, name, hidden):
     found, expected, start = both(network(3, hidden), known, tables(known)[name], pushes(hidden))
     assert np.abs(expected - start).max() > 0.01  # something is pushed
@@ -104,8 +103,3 @@ def test_what_was_moving_goes_on(known):
     found, expected, start = both(network(3, 32), known, state, actions, before)
     assert np.abs(found[:, 0] - start).max() > 1e-3
     np.testing.assert_allclose(found[:, 0], expected[:, 0], atol=1e-6)
-
-
-def test_networks_of_any_width_are_rolled_out(known):
-    found, expected, _ = both(network(3, 18), known, tables(known)["one"], pushes(1))
-    assert np.median(np.abs(found - expected)) < 1e-6

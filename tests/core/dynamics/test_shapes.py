@@ -27,16 +27,14 @@ from osfcore.dynamics.shapes import (
     solids,
     write_parts,
 )
-from osfcore.errors import CannotWrite, InvalidInput, OsfError
-from osfcore.fields.field_library import FieldLibrary
+from osfcore.errors import InvalidInput, OsfError
 from osfcore.fields.kiloosf import EMPTY_G
 from osfcore.geometry.polygons import gap_to_point
-from osfcore.geometry.poses import quaternion_exp, quaternion_to_matrix, rotate
 from osfcore.geometry.torch_rotations import facing
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
-from tests.core.dynamics.scenes import BOX, NAMES, angle_bracket, boxes, hull
+from tests.core.dynamics.scenes import NAMES, angle_bracket, boxes, hull
 from tests.core.dynamics.solids import VOXEL, bracket
-from tests.core.render.scenes import ball, block, random_field
+from tests.support.rendered_scenes import ball, block
 
 # Object shapes
 
@@ -50,13 +48,7 @@ def only(shape) -> tuple[ShapeTable, torch.Tensor]:
     return ShapeTable((shape,)), torch.zeros(1, dtype=torch.long)
 
 
-def turned(seed: int) -> tuple[np.ndarray, torch.Tensor]:
-    q = quaternion_exp(np.random.default_rng(seed).normal(size=3))
-    return q, torch.as_tensor(quaternion_to_matrix(q), dtype=torch.float32)[None]
-
-
-@pytest.mark.parametrize("side", [1, 2, 3, 16, MAP_SIDE])
-@pytest.mark.parametrize("scale", [1.0, 0.01, 30.0])
+@pytest.mark.parametrize(("side", "scale"), [(1, 1.0), (3, 30.0), (MAP_SIDE, 0.01)])
 def test_every_direction_of_the_map_lies_in_its_own_cell(side, scale):
     d = octahedral_directions(side)
     np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, atol=1e-12)
@@ -66,69 +58,26 @@ def test_every_direction_of_the_map_lies_in_its_own_cell(side, scale):
 
 def test_the_map_covers_the_sphere_evenly_enough():
     own = torch.as_tensor(octahedral_directions(MAP_SIDE), dtype=torch.float32)
-    d = directions(20_000)
+    d = torch.cat([directions(20_000), torch.eye(3), -torch.eye(3), -0.0 - torch.eye(3)])
     nearest = own[octahedral_index(d, MAP_SIDE)]
     assert torch.linalg.cross(nearest, d).norm(dim=1).max() < np.deg2rad(4)
     assert (nearest * d).sum(dim=1).min() > 0
 
 
-def test_directions_along_axes_have_a_cell_beside_them():
-    axes = torch.cat([torch.eye(3), -torch.eye(3), -0.0 - torch.eye(3)])
-    own = torch.as_tensor(octahedral_directions(MAP_SIDE), dtype=torch.float32)
-    assert (own[octahedral_index(axes, MAP_SIDE)] * axes).sum(dim=1).min() > np.cos(np.deg2rad(4))
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", NAMES[:2])
 def test_support_is_that_of_the_hull_but_for_the_width_of_a_cell(shapes, name):
     shape, d = shapes[name], directions()
     table, number = only(shape)
     exact = (d.double().numpy() @ hull(shape).T).max(axis=1)
     lacking = exact - table.extents(number, torch.eye(3)[None], d)[0].numpy()
-    own = octahedral_directions(MAP_SIDE)[octahedral_index(d, MAP_SIDE)]
-    off = np.linalg.norm(own - d.numpy(), axis=1)
+    cells = octahedral_directions(MAP_SIDE)
+    off = np.linalg.norm(cells[octahedral_index(d, MAP_SIDE)] - d.numpy(), axis=1)
     assert lacking.min() > -1e-7  # a point of the hull is never beyond it
     assert np.all(lacking < 2 * shape.radius * off + 1e-7)
-    assert np.median(lacking) < 1.5e-4
     assert np.sqrt(np.mean(lacking**2)) < 2.5e-4
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_on_the_directions_of_the_map_support_is_exact(shapes, name):
-    d = octahedral_directions(MAP_SIDE)
-    exact = (d @ hull(shapes[name]).T).max(axis=1)
-    np.testing.assert_allclose((d * shapes[name].support).sum(axis=1), exact, atol=1e-8)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_lookups_turn_with_the_object(shapes, seed):
-    q, rotation = turned(seed)
-    shape, d = shapes[BOX], directions()
-    table, number = only(shape)
-    farthest = table.farthest(number, rotation, d)[0]
-    exact = (d.numpy() @ rotate(q, hull(shape)).T).max(axis=1)
-    reach = (farthest * d).sum(dim=1)
-    assert np.sqrt(np.mean((exact - reach.numpy()) ** 2)) < 2.5e-4
-    torch.testing.assert_close(table.extents(number, rotation, d)[0], reach, atol=1e-6, rtol=0)
-    back = farthest @ rotation[0]  # R^T p is one of the hull's points
-    distance = np.linalg.norm(back.numpy()[:200, None] - hull(shape)[None], axis=2).min(axis=1)
-    assert distance.max() < 1e-6
-
-
-def test_every_object_is_looked_up_by_its_own_number(shapes, table):
-    d = directions(50)
-    together = table.extents(torch.arange(4), torch.eye(3).expand(4, 3, 3), d)
-    for row, name in zip(together, sorted(shapes), strict=True):
-        alone, number = only(shapes[name])
-        assert torch.equal(row, alone.extents(number, torch.eye(3)[None], d)[0])
-
-
-def test_a_ball_reaches_equally_far_everywhere():
-    shape = object_shape(ball(0.05, voxel=0.004))
-    reach = np.linalg.norm(shape.support, axis=1)
-    assert np.ptp(reach) < 1.5e-3
-    np.testing.assert_allclose(shape.half_extents, shape.half_extents[0], atol=1e-6)
-    np.testing.assert_allclose(shape.half_extents[0], shape.radius, atol=1e-3)
-    np.testing.assert_allclose(shape.centre, 0, atol=1e-6)
+    np.testing.assert_allclose((cells * shape.support).sum(axis=1), (cells @ hull(shape).T).max(axis=1), atol=1e-8)
+    np.testing.assert_allclose(np.ptp(hull(shape), axis=0) / 2, shape.half_extents, atol=2e-4)
+    assert np.linalg.norm(hull(shape), axis=1).max() == pytest.approx(shape.radius, abs=1e-6)
 
 
 def test_a_block_reaches_as_far_as_its_sides():
@@ -141,32 +90,14 @@ def test_a_block_reaches_as_far_as_its_sides():
     np.testing.assert_allclose(shape.centre, 0, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_half_extents_and_radius_hold_the_hull(shapes, name):
-    shape = shapes[name]
-    np.testing.assert_allclose(np.ptp(hull(shape), axis=0) / 2, shape.half_extents, atol=2e-4)
-    assert np.linalg.norm(hull(shape), axis=1).max() == pytest.approx(shape.radius, abs=1e-6)
-
-
-def test_real_objects_have_the_size_of_their_packages(shapes):
-    box = 2000 * shapes[BOX].half_extents
-    assert np.all(np.abs(box - [71.5, 164, 213.5]) < 8)  # the catalogue's 60 x 158 x 210, a little askew in its frame
-
-
 def test_shapes_do_not_depend_on_where_the_origin_is():
     field = block()
     there = object_shape(replace(field, origin=field.origin + np.float32([0.1, -0.2, 0.3])))
     here = object_shape(field)
     np.testing.assert_allclose(there.centre - here.centre, [0.1, -0.2, 0.3], atol=1e-6)
     np.testing.assert_allclose(np.sort(hull(there), axis=0), np.sort(hull(here), axis=0), atol=1e-6)
-
-
-@pytest.mark.parametrize("g", [-10.0, -3.0])
-def test_a_field_without_anything_solid_is_refused(g):
-    field = block()
-    rows = np.full_like(field.rows, g)
-    with pytest.raises(OsfError, match="solid"):
-        object_shape(replace(field, rows=rows))
+    with pytest.raises(OsfError):  # nothing is solid
+        object_shape(replace(field, rows=np.full_like(field.rows, -3.0)))
 
 
 # Field parts
@@ -184,13 +115,6 @@ def test_a_convex_field_has_no_parts_and_a_closed_surface(field):
     mesh = trimesh.Trimesh(*field_mesh(field))
     assert mesh.is_watertight
     assert mesh.volume > 0  # triangles face outward
-
-
-def test_the_surface_lies_where_the_solid_ends():
-    vertices, _ = field_mesh(ball(0.05, voxel=VOXEL))
-    assert np.linalg.norm(vertices, axis=1) == pytest.approx(0.05, abs=VOXEL)
-    vertices, _ = field_mesh(block((0.05, 0.03, 0.02), voxel=VOXEL))
-    assert np.abs(vertices).max(axis=0) == pytest.approx(np.array([0.05, 0.03, 0.02]), abs=VOXEL)
 
 
 def test_a_bracket_has_parts_that_leave_its_corner_free():
@@ -224,14 +148,9 @@ def test_what_a_lost_neck_bore_counts():
 def test_a_field_without_a_solid_part_is_told():
     field = ball(0.03, voxel=VOXEL)
     object.__setattr__(field, "density", np.full_like(field.density, -9.0))
-    with pytest.raises(InvalidInput, match="solid"):
+    with pytest.raises(InvalidInput):
         field_mesh(field)
     assert field_parts(field) == ()
-
-
-def test_a_field_of_noise_has_some_parts_or_none():
-    for part in field_parts(random_field(np.random.default_rng(0))):
-        assert np.isfinite(part).all()
 
 
 def test_files_give_back_what_was_written_for_the_same_field(tmp_path):
@@ -246,43 +165,19 @@ def test_files_give_back_what_was_written_for_the_same_field(tmp_path):
     assert read_parts(path, "abc") == ()
 
 
-@pytest.mark.parametrize("length", [0, 7, 60, 300])
-def test_broken_files_count_as_missing(tmp_path, length):
+def test_files_of_anything_else_count_as_missing(tmp_path):
     path = tmp_path / "parts.safetensors"
     assert read_parts(path, "abc") is None
     write_parts(path, (np.zeros((30, 3), np.float32),), "abc")
-    path.write_bytes(path.read_bytes()[:length])
-    assert read_parts(path, "abc") is None
-
-
-@pytest.mark.parametrize("part", [np.zeros((4, 2)), np.zeros((0, 3)), np.full((4, 3), np.nan), np.zeros(3)])
-def test_files_of_anything_else_count_as_missing(tmp_path, part):
-    path = tmp_path / "parts.safetensors"
-    write_parts(path, (np.zeros((4, 3), np.float32),), "abc")
+    whole = path.read_bytes()
     with safe_open(path, "numpy") as file:
         header = file.metadata()
-    save_file({"0": part.astype(np.float32)}, path, header)
-    assert read_parts(path, "abc") is None
-
-
-def test_a_place_that_cannot_be_written_is_told(tmp_path):
-    (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(CannotWrite):
-        write_parts(tmp_path / "file" / "parts.safetensors", (), "abc")
-
-
-@pytest.mark.slow
-def test_parts_of_a_real_drill_fill_it_but_for_its_hollows():
-    field = FieldLibrary(None).load("035_power_drill")
-    parts = field_parts(field)
-    assert 3 <= len(parts) <= 9
-    vertices, faces = field_mesh(field)
-    inside = np.min(
-        [(h.equations[:, :3] @ vertices.T + h.equations[:, 3:]).max(axis=0) for h in map(ConvexHull, parts)], 0
-    )
-    assert np.percentile(inside, 95) < 4e-3
-    assert sum(ConvexHull(part).volume for part in parts) < 0.8 * ConvexHull(vertices).volume
-    assert sum(ConvexHull(part).volume for part in parts) > 0.8 * trimesh.Trimesh(vertices, faces).volume
+    for length in (0, 7, 60, 300):
+        path.write_bytes(whole[:length])
+        assert read_parts(path, "abc") is None
+    for part in (np.zeros((4, 2)), np.zeros((0, 3)), np.full((4, 3), np.nan), np.zeros(3)):
+        save_file({"0": part.astype(np.float32)}, path, header)
+        assert read_parts(path, "abc") is None
 
 
 # Contact geometry
@@ -312,22 +207,6 @@ def test_the_pusher_fits_into_a_corner_that_the_hull_would_fill():
     assert float(whole.distance) < 0.035 - 0.02  # the hull's hypotenuse is nearer
 
 
-def test_the_face_is_the_side_of_the_nearest_part():
-    parts, _ = seen(ShapeTable((angle_bracket(),)), [(0, -0.055, -0.04, 0.02, 0.0)])  # the other arm is 3.5 cm away
-    face = pusher_contact(parts, STILL).face[0]
-    torch.testing.assert_close(face, torch.tensor([[0.045, -0.02], [-0.075, -0.02]]), atol=1e-4, rtol=0)
-
-
-@pytest.mark.parametrize("turn", np.linspace(0, 6, 7))
-def test_a_convex_object_is_touched_at_its_hull(turn):
-    box = boxes(((0.0, 0.0, 0.0), (0.03, 0.02, 0.04)))
-    parts, outline = seen(ShapeTable((box,)), [(0, 0.06, 0.01, 0.04, turn)])
-    contact = pusher_contact(parts, STILL)
-    whole = gap_to_point(outline, STILL)
-    assert torch.equal(parts.outline, outline)
-    assert float(contact.before.distance) == pytest.approx(float(whole.distance) - PUSHER_RADIUS_M, abs=1e-7)
-
-
 def test_what_is_cut_into_parts_is_touched_where_the_whole_is():
     """A box, and the same box of eight parts: parts change nothing where there is no hollow."""
     whole = boxes(((0.0, 0.0, 0.0), (0.04, 0.04, 0.04)))
@@ -354,12 +233,6 @@ def test_what_is_above_the_pusher_is_not_touched():
     assert float(pusher_contact(lower, STILL).before.distance) < 0
 
 
-def test_an_object_that_is_wholly_out_of_reach_is_far_away():
-    box = boxes(((0.0, 0.0, 0.0), (0.03, 0.02, 0.04)))
-    parts, _ = seen(ShapeTable((box,)), [(0, 0.0, 0.0, 0.3, 0.0)])
-    assert float(pusher_contact(parts, STILL).halfway.distance) > 0.5
-
-
 def test_brackets_that_hold_each_other_do_not_overlap():
     """Two brackets, one turned by 180 degrees, the ends of its arms 2 cm off within the other's corner."""
     table = ShapeTable((angle_bracket(),))
@@ -383,12 +256,3 @@ def test_parts_one_above_the_other_do_not_touch():
     contact = pair_contact(parts, outline, torch.tensor([0]), torch.tensor([1]))
     assert float(contact.gap.distance) == pytest.approx(0.015, abs=1e-4)
     torch.testing.assert_close(contact.gap.normal, torch.tensor([[1.0, 0.0]]), atol=1e-4, rtol=0)
-
-
-def test_the_order_of_parts_does_not_matter():
-    bracket = angle_bracket()
-    table = ShapeTable((bracket, replace(bracket, parts=bracket.parts[::-1])))
-    parts, _ = seen(table, [(number, 0.02, -0.055, 0.02, 0.7) for number in (0, 1)])
-    contact = pusher_contact(parts, torch.zeros(2, 2))
-    assert torch.equal(contact.before.distance[0], contact.before.distance[1])
-    assert torch.equal(contact.before.point[0], contact.before.point[1])

@@ -7,8 +7,8 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, STEP_S
-from osfcore.io.push_file import EpisodeFolder, PushEpisode, save_episode
-from osfcore.paper.dynamics import LENGTH_M, GraphNetwork, Scenes
+from osfcore.io.push_file import PushEpisode
+from osfcore.paper.dynamics import GraphNetwork, Scenes
 
 NAMES = CAN, BOX = ("005_tomato_soup_can", "009_gelatin_box")
 KAPPAS = {CAN: 0.1, BOX: 0.08}
@@ -58,17 +58,3 @@ def episode(seed: int = 0, *, steps: int = 8, names=NAMES, side: float | None = 
     quaternions = np.tile([1.0, 0, 0, 0], (steps + 1, len(names), 1))
     contact = np.linalg.norm(np.diff(positions, axis=0), axis=-1) > 0
     return PushEpisode(tuple(names), seed, positions, quaternions, pusher, actions, contact)
-
-
-def write(path, episodes):
-    """A push file."""
-    with EpisodeFolder(path, {}) as folder:
-        for number, e in enumerate(episodes):
-            save_episode(folder.path(number), e)
-        folder.combine(len(episodes))
-    return path
-
-
-def in_units(metres: float) -> float:
-    """A length as the network and its loss tell it."""
-    return metres / LENGTH_M

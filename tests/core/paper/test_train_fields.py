@@ -8,7 +8,7 @@ from osfcore.errors import InvalidInput
 from osfcore.fields.train_osf import Rates, TeacherRecipe
 from osfcore.paper.fields import read_field
 from osfcore.paper.train_fields import PaperFieldRecipe, TrainPaperField, train_paper_field
-from tests.core.fields.rendered_sets import painted_block, write_object_set
+from tests.support.rendered_sets import painted_block, write_object_set
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 QUICK = PaperFieldRecipe(
