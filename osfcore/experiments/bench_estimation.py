@@ -1,4 +1,4 @@
-"""What estimates cost: a first frame, a later frame, a goal; medians over a fixed set of scenes.
+"""Time estimates: a first frame, a later frame, a goal; medians over a fixed set of scenes.
 
 Fields are loaded, code is compiled and resting orientations are known before anything is timed. A later frame begins
 with the estimate of the frame before it and follows a push.
@@ -8,28 +8,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from osfcore.errors import InvalidInput, check_ranges, check_seed
-from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
+from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first_calibrated
 from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
-from osfcore.experiments.estimation_tasks import episode, first_frame, goals
-from osfcore.experiments.estimation_warmup import WARM_SCENE, last_estimate, warm_models
-from osfcore.experiments.fields import measurable
+from osfcore.experiments.estimation_tasks import WARM_SCENE, episode, first_frame, goals, last_estimate, warm_models
+from osfcore.experiments.harness import MAX_TASKS, EvaluationStep, measurable
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
-from osfcore.geometry.states import MAX_OBJECTS, EstimatedState
+from osfcore.geometry.states import MAX_OBJECTS, SceneState
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import DEFAULT_NAMES
 from osfcore.random_streams import Stream, stream_rng
-from osfcore.world.tasks import Draw, draw_scene
+from osfcore.world.tasks import draw_scene
 
 _FIRST_SCENE = 700_000  # no figure of accuracy is measured on these scenes
-_MOST_SCENES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,54 +55,12 @@ class BenchEstimate:
     goal: GoalImageConfig = field(default_factory=GoalImageConfig)
 
 
-@dataclass(frozen=True, slots=True)
-class EstimateCosts:
-    """Times of estimates.
-
-    Attributes:
-        first_s: median of first frames with four views and masks [s].
-        next_s: median of later frames [s].
-        next_s_p90: what nine of ten later frames stay below [s].
-        goal_s: median of goals [s].
-        refine_hz: later frames a second, by the median.
-        scenes: how many.
-        objects: in each of them.
-        threads: that compiled code may use.
-    """
-
-    first_s: float
-    next_s: float
-    next_s_p90: float
-    goal_s: float
-    refine_hz: float
-    scenes: int
-    objects: int
-    threads: int
-
-    def to_json(self) -> dict[str, float | int]:
-        """As plain numbers."""
-        return asdict(self)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class BenchEstimateStep:
-    """How far the measurement is.
-
-    Attributes:
-        done: scenes finished.
-        total: scenes in all.
-        note: what is being done.
-        report: with the last step only.
-    """
-
-    done: int
-    total: int
-    note: str
-    report: EstimateCosts | None = None
-
-
-def bench_estimate(config: BenchEstimate, fields: FieldLibrary, assets: AssetLibrary) -> Iterator[BenchEstimateStep]:
+def bench_estimate(config: BenchEstimate, fields: FieldLibrary, assets: AssetLibrary) -> Iterator[EvaluationStep]:
     """Time every kind of estimate, scene by scene.
+
+    The report has medians of first frames with four views and masks "first_s", of later frames "next_s" and of goals
+    "goal_s" [s], what nine of ten later frames stay below "next_s_p90" [s], later frames a second by the median
+    "refine_hz", the numbers of "scenes" and "objects" in each, and the "threads" that compiled code may use.
 
     Args:
         config: what to measure, and how often.
@@ -115,66 +71,53 @@ def bench_estimate(config: BenchEstimate, fields: FieldLibrary, assets: AssetLib
         InvalidInput: if a number is out of range, or there are too few objects.
         MissingAssets: if no object has both a field and a mesh.
     """
-    names = _checked(config, fields, assets)
-    yield BenchEstimateStep(0, config.scenes, "Warming up")
+    import numba
+
+    names, cameras, total = _checked_names(config, fields, assets), default_cameras(config.size), config.scenes
+    yield EvaluationStep(0, total, "Warming up")
     draw = draw_scene(names, config.objects, config.seed, WARM_SCENE)
     models = warm_models(names, fields, assets, draw, config.size)
     first: list[float] = []
     later: list[float] = []
     goal: list[float] = []
-    for number in range(config.scenes):
-        yield BenchEstimateStep(number, config.scenes, f"Estimating (scene {number + 1} of {config.scenes})")
-        scene, rng = _Scene(config, assets, names, number), stream_rng(config.seed, Stream.BENCHMARK, number)
-        start, seconds = _timed(estimate_first(models, scene.first, rng, config.effort))
-        first.append(seconds)
-        expected = start.state
-        for observation in scene.later:
-            estimate, seconds = _timed(estimate_next(models, observation, expected, rng, config.track))
-            later.append(seconds)
-            expected = estimate.state
-        _, seconds = _timed(estimate_goal(models, scene.goal, start.state, config.goal))
-        goal.append(seconds)
-    yield BenchEstimateStep(config.scenes, config.scenes, "Everything is measured", _costs(config, first, later, goal))
+    for number in range(total):
+        yield EvaluationStep(number, total, f"Estimating (scene {number + 1} of {total})")
+        draw = draw_scene(names, config.objects, config.seed, _FIRST_SCENE + number)
+        seen = first_frame(draw, assets, cameras).observation
+        pushes = episode(draw, assets, cameras, steps=config.steps)
+        goal_image = goals(draw, assets, goal_camera(config.size))[0].frame.observation
+        rng = stream_rng(config.seed, Stream.BENCHMARK, number)
+        start = _timed(estimate_first_calibrated(models, seen, rng, config.effort), first)
+        expected = start
+        for frame in pushes.frames:
+            expected = _timed(estimate_next(models, frame.observation, expected, rng, config.track), later)
+        _timed(estimate_goal(models, goal_image, start, config.goal), goal)
+    typical = float(np.median(later))
+    costs = {
+        "first_s": float(np.median(first)),
+        "next_s": typical,
+        "next_s_p90": float(np.quantile(later, 0.9)),
+        "goal_s": float(np.median(goal)),
+        "refine_hz": 1 / typical,
+        "scenes": total,
+        "objects": config.objects,
+        "threads": int(numba.get_num_threads()),
+    }
+    yield EvaluationStep(total, total, "Everything is measured", costs)
 
 
-class _Scene:
-    """What the estimators are shown of one scene."""
-
-    def __init__(self, config: BenchEstimate, assets: AssetLibrary, names: tuple[str, ...], number: int) -> None:
-        draw: Draw = draw_scene(names, config.objects, config.seed, _FIRST_SCENE + number)
-        cameras = default_cameras(config.size)
-        self.first = first_frame(draw, assets, cameras).observation
-        self.later = [frame.observation for frame in episode(draw, assets, cameras, steps=config.steps).frames]
-        self.goal = goals(draw, assets, goal_camera(config.size))[0].frame.observation
-
-
-def _timed(steps: Iterator[EstimateStep]) -> tuple[EstimatedState, float]:
-    """Run an estimate, which does nothing before its first step; its result, and how long it took [s]."""
+def _timed(steps: Iterator[EstimateStep], seconds: list[float]) -> SceneState:
+    """Run an estimate, which does nothing before its first step, and note how long it took [s]."""
     start = time.perf_counter()
     estimate = last_estimate(steps)
-    return estimate, time.perf_counter() - start
+    seconds.append(time.perf_counter() - start)
+    return estimate.state
 
 
-def _costs(config: BenchEstimate, first: list[float], later: list[float], goal: list[float]) -> EstimateCosts:
-    import numba
-
-    typical = float(np.median(later))
-    return EstimateCosts(
-        first_s=float(np.median(first)),
-        next_s=typical,
-        next_s_p90=float(np.quantile(later, 0.9)),
-        goal_s=float(np.median(goal)),
-        refine_hz=1 / typical,
-        scenes=config.scenes,
-        objects=config.objects,
-        threads=int(numba.get_num_threads()),
-    )
-
-
-def _checked(config: BenchEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+def _checked_names(config: BenchEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
     check_ranges(
-        ("number of scenes", config.scenes, 1, _MOST_SCENES),
-        ("later frames of each scene", config.steps, 1, _MOST_SCENES),
+        ("number of scenes", config.scenes, 1, MAX_TASKS),
+        ("later frames of each scene", config.steps, 1, MAX_TASKS),
         ("objects in a scene", config.objects, 1, MAX_OBJECTS),
     )
     check_seed(config.seed)

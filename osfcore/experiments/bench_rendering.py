@@ -1,4 +1,4 @@
-"""What rendering costs: new scenes against TinyRenderer, planning, the reference, and how the cost grows.
+"""Time rendering: new scenes against TinyRenderer, planning, the reference, and how the cost grows.
 
 All figures come from one run on one machine and belong together. Before anything is timed, compiled code is compiled
 and both renderers have drawn the same objects once (TinyRenderer has read its meshes, ours has unpacked its fields);
@@ -8,7 +8,7 @@ every timed scene is new: poses, light and pusher have not been drawn before. Ob
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -16,10 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import InvalidInput, check_seed
-from osfcore.experiments.fields import measurable
+from osfcore.experiments.harness import EvaluationStep, measurable
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.fields.table import TableField
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, default_cameras, goal_camera
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import SceneState
@@ -36,12 +35,10 @@ from osfcore.world.physics import lowest_point
 from osfcore.world.scenes import random_rest
 from osfcore.world.tiny_renderer import TinyScene
 
-# What a benchmark of rendering reports.
-
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """One row of a table.
+    """Time of a call at one size.
 
     Attributes:
         size: number of objects, side of the image [px], or scenes in a batch.
@@ -56,60 +53,24 @@ class Cost:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RenderReport:
-    """What rendering costs; medians.
+    """Costs of rendering.
 
     Attributes:
-        tinyrenderer_ms: one new scene by plain TinyRenderer with its shadow [ms].
-        scene_exact_ms: the same scene by us, carefully [ms].
-        scene_ms: the same scene by us, at planning quality [ms].
-        planning_renders_per_s: images a second when planning.
-        planning_psnr: of planning images against exact ones [dB].
-        reference_ms: one such scene by the reference renderer [ms].
-        threads: that we may use; TinyRenderer has one.
-        objects: cost by number of objects.
-        resolution: cost by side of the image.
-        batch: cost by number of scenes in one call, at planning quality.
+        figures: plain numbers, medians: one new scene by plain TinyRenderer with its shadow "tinyrenderer_ms", by us
+            carefully "scene_exact_ms" and at planning quality "scene_ms" [ms], and how many times faster we are;
+            images a second when planning, and their PSNR against exact ones [dB]; one such scene by the reference
+            renderer "reference_ms" [ms]; the "threads" that we may use, where TinyRenderer has one; costs by number
+            of objects, by side of the image and by number of scenes in one call; and "growth": how steeply these
+            costs grow, where 1 is in proportion.
         shown: a scene by TinyRenderer and by us.
     """
 
-    tinyrenderer_ms: float
-    scene_exact_ms: float
-    scene_ms: float
-    planning_renders_per_s: float
-    planning_psnr: float
-    reference_ms: float
-    threads: int
-    objects: tuple[Cost, ...]
-    resolution: tuple[Cost, ...]
-    batch: tuple[Cost, ...]
+    figures: dict[str, Any]
     shown: tuple[Comparison, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """The report as plain numbers, with how steeply cost grows: 1 is in proportion, less is better."""
-        growth = {
-            "objects": slope([c.size for c in self.objects], [c.ms for c in self.objects]),
-            "pixels": slope([c.size**2 for c in self.resolution], [c.ms for c in self.resolution]),
-            "batch": slope([c.size for c in self.batch], [c.ms for c in self.batch]),
-        }
-        return {
-            "tinyrenderer_ms": self.tinyrenderer_ms,
-            "scene_exact_ms": self.scene_exact_ms,
-            "ratio_exact": self.tinyrenderer_ms / self.scene_exact_ms,
-            "scene_ms": self.scene_ms,
-            "ratio": self.tinyrenderer_ms / self.scene_ms,
-            "planning_renders_per_s": self.planning_renders_per_s,
-            "planning_psnr": self.planning_psnr,
-            "reference_ms": self.reference_ms,
-            "threads": self.threads,
-            "by_objects": [asdict(cost) for cost in self.objects],
-            "by_resolution": [asdict(cost) for cost in self.resolution],
-            "by_batch": [asdict(cost) for cost in self.batch],
-            "growth": growth,
-        }
 
 
 def slope(sizes: Sequence[float], costs: Sequence[float]) -> float | None:
-    """The exponent p of the best fit cost ~ size^p; None with fewer than two sizes."""
+    """Return the exponent p of the best fit cost ~ size^p; None with fewer than two sizes."""
     if len(sizes) < 2:
         return None
     return float(np.polyfit(np.log(sizes), np.log(costs), 1)[0])
@@ -147,24 +108,9 @@ class BenchRender:
     seed: int = 0
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class BenchStep:
-    """How far the measurement is.
-
-    Attributes:
-        done: parts finished.
-        total: parts in all.
-        note: what is being measured.
-        report: with the last step only.
-    """
-
-    done: int
-    total: int
-    note: str
-    report: RenderReport | None = None
-
-
-def bench_render(config: BenchRender, fields: FieldLibrary, assets: AssetLibrary) -> Iterator[BenchStep]:
+def bench_render(
+    config: BenchRender, fields: FieldLibrary, assets: AssetLibrary
+) -> Iterator[EvaluationStep[RenderReport]]:
     """Measure everything, one part after the other.
 
     Args:
@@ -176,38 +122,56 @@ def bench_render(config: BenchRender, fields: FieldLibrary, assets: AssetLibrary
         InvalidInput: if a number is out of range, or there is no field.
         MissingAssets: if no object has both a field and a mesh.
     """
+    import numba
+
     for what, value in (("new scenes", config.scenes), ("repeats", config.repeats)):
         if value < 1:
             raise InvalidInput(f"number of {what}", value, "1 or more")
     check_seed(config.seed)
     parts = ("new scenes", "planning", "the reference", "numbers of objects", "resolutions", "batches")
 
-    def step(number: int) -> BenchStep:
-        return BenchStep(number, len(parts), f"Measuring {parts[number]}")
+    def step(number: int) -> EvaluationStep[RenderReport]:
+        return EvaluationStep(number, len(parts), f"Measuring {parts[number]}")
 
-    yield BenchStep(0, len(parts), "Compiling")
+    yield EvaluationStep(0, len(parts), "Compiling")
     stage = _Stage(config, fields, assets)
     stage.warm_up()
     yield step(0)
-    new_scenes, shown = stage.new_scenes()
+    (tiny_ms, exact_ms, planning_ms), shown = stage.new_scenes()
     yield step(1)
-    planning, planning_psnr = stage.planning()
+    renders_per_s, planning_psnr = stage.planning()
     yield step(2)
     reference_ms = stage.reference()
     yield step(3)
-    objects = tuple(stage.by_objects(count) for count in config.counts)
+    objects = [stage.cost(n, n, config.side, 1, NEW_SCENE_QUALITY) for n in config.counts]
     yield step(4)
-    resolution = tuple(stage.by_side(side) for side in config.sides)
+    resolution = [stage.cost(side, OBJECTS, side, 1, NEW_SCENE_QUALITY) for side in config.sides]
     yield step(5)
-    batch = tuple(stage.by_batch(size) for size in config.batches)
-    report = RenderReport(
-        *new_scenes, planning, planning_psnr, reference_ms, _threads(), objects, resolution, batch, shown
-    )
-    yield BenchStep(len(parts), len(parts), "Everything is measured", report)
+    batch = [stage.cost(n, OBJECTS, config.side, n, PLANNING_QUALITY) for n in config.batches]
+    figures = {
+        "tinyrenderer_ms": tiny_ms,
+        "scene_exact_ms": exact_ms,
+        "ratio_exact": tiny_ms / exact_ms,
+        "scene_ms": planning_ms,
+        "ratio": tiny_ms / planning_ms,
+        "planning_renders_per_s": renders_per_s,
+        "planning_psnr": planning_psnr,
+        "reference_ms": reference_ms,
+        "threads": int(numba.get_num_threads()),
+        "by_objects": [asdict(cost) for cost in objects],
+        "by_resolution": [asdict(cost) for cost in resolution],
+        "by_batch": [asdict(cost) for cost in batch],
+        "growth": {
+            "objects": slope([c.size for c in objects], [c.ms for c in objects]),
+            "pixels": slope([c.size**2 for c in resolution], [c.ms for c in resolution]),
+            "batch": slope([c.size for c in batch], [c.ms for c in batch]),
+        },
+    }
+    yield EvaluationStep(len(parts), len(parts), "Everything is measured", RenderReport(figures, shown))
 
 
 def lay_out(assets: Sequence[ObjectAsset], rng: np.random.Generator) -> Pose:
-    """Resting orientations in random places of a grid over the workspace, which large objects may outgrow."""
+    """Return resting poses in random places of a grid over the workspace, which large objects may outgrow."""
     side = int(np.ceil(np.sqrt(len(assets))))
     pitch = 2 * WORKSPACE_HALF_M / side
     places = np.array(list(np.ndindex(side, side)))[rng.permutation(side**2)[: len(assets)]]
@@ -220,7 +184,7 @@ def lay_out(assets: Sequence[ObjectAsset], rng: np.random.Generator) -> Pose:
 def rollouts(
     start: Pose, light: Light, names: tuple[str, ...], rng: np.random.Generator, candidates: int, steps: int
 ) -> SceneBatch:
-    """Images that planning asks for, candidate by candidate: one or two objects of each slide and turn step by step.
+    """Return scenes as planning renders them: in each candidate one or two objects slide and turn step by step.
 
     Args:
         start: T_world_object of all objects [m].
@@ -259,18 +223,18 @@ class _Stage:
         both = {name: loaded[name.rpartition(" ")[0]] for name in self._names}
         self._fields = {name: field for name, (field, _) in both.items()}
         self._assets = {name: asset for name, (_, asset) in both.items()}
-        self._table: TableField = fields.load_table()
+        self._table = fields.load_table()
         self._ours = SceneRenderer(self._fields, self._table)
 
     def warm_up(self) -> None:
-        """Let compiled code be compiled for every quality."""
+        """Compile code for every quality."""
         state, camera = self._scene(OBJECTS), default_cameras(self._config.side)[0]
         for quality in (NEW_SCENE_QUALITY, PLANNING_QUALITY):
             self._ours.render(SceneBatch.of(state), (camera,), quality=quality)
             self._ours.render(SceneBatch.of(replace(state, pusher=None)), (camera,), quality=quality)
 
     def new_scenes(self) -> tuple[tuple[float, float, float], tuple[Comparison, ...]]:
-        """Median times of TinyRenderer, ours and ours at planning quality [ms], turn about; and what both drew."""
+        """Return median times of TinyRenderer, ours and ours at planning quality [ms], and what both drew."""
         cameras = default_cameras(self._config.side)
         tiny = TinyScene({name: self._assets[name] for name in self._names[:OBJECTS]})
         times, shown = [], []
@@ -294,7 +258,7 @@ class _Stage:
         return (tiny_ms, ours_ms, planning_ms), tuple(shown)
 
     def planning(self) -> tuple[float, float]:
-        """Images a second for new rollouts in one call each; PSNR of some of them against exact ones [dB]."""
+        """Return images a second for new rollouts in one call each, and PSNR of some against exact ones [dB]."""
         camera = (goal_camera(self._config.side),)
         times, quality = [], 0.0
         for number in range(self._config.repeats + 1):
@@ -305,13 +269,19 @@ class _Stage:
             times.append(time.perf_counter() - start)
             if number == 0:
                 chosen = np.arange(0, CANDIDATES * STEPS, CANDIDATES)
-                exact = self._ours.render(_part(batch, chosen), camera, quality=EXACT).rgb
+                some = replace(
+                    batch,
+                    positions=batch.positions[chosen],
+                    quaternions=batch.quaternions[chosen],
+                    lights=batch.lights[chosen],
+                )
+                exact = self._ours.render(some, camera, quality=EXACT).rgb
                 pairs = zip(exact[:, 0], images[chosen, 0], strict=True)
                 quality = float(np.mean([psnr(a, b) for a, b in pairs]))
         return CANDIDATES * STEPS / float(np.median(times[1:])), quality  # the first call warms up
 
     def reference(self) -> float:
-        """Time of the reference renderer for one new scene [ms]."""
+        """Return the time of the reference renderer for one new scene [ms]."""
         from osfcore.render.reference import render_reference
 
         state, camera = self._scene(OBJECTS), default_cameras(self._config.side)[0]
@@ -319,27 +289,26 @@ class _Stage:
         render_reference(self._fields, self._table, state, camera, quality=NEW_SCENE_QUALITY)
         return 1000 * (time.perf_counter() - start)
 
-    def by_objects(self, count: int) -> Cost:
-        """One new scene of so many objects."""
-        return self._cost(count, count, self._config.side, 1, NEW_SCENE_QUALITY)
+    def cost(self, size: int, count: int, side: int, scenes: int, quality: Quality) -> Cost:
+        """Return the median time of a call.
 
-    def by_side(self, side: int) -> Cost:
-        """One new scene at another resolution."""
-        return self._cost(side, OBJECTS, side, 1, NEW_SCENE_QUALITY)
-
-    def by_batch(self, size: int) -> Cost:
-        """So many different scenes under different lights in one call."""
-        return self._cost(size, OBJECTS, self._config.side, size, PLANNING_QUALITY)
-
-    def _cost(self, size: int, count: int, side: int, scenes: int, quality: Quality) -> Cost:
+        Args:
+            size: that the cost is noted for.
+            count: objects in a scene.
+            side: of the images [px].
+            scenes: different ones under different lights in one call.
+            quality: of the images.
+        """
         cameras = default_cameras(side)
         repeats = self._config.repeats if scenes > 8 else 4 * self._config.repeats
         self._ours.render(self._batch(count, 1), cameras[:1], quality=quality)  # unpacks the fields
-
-        def prepare(number: int) -> tuple[SceneBatch, tuple[Camera]]:
-            return self._batch(count, scenes), (cameras[number % len(cameras)],)
-
-        ms = _median_ms(prepare, lambda job: self._ours.render(*job, quality=quality), repeats)
+        times = []
+        for number in range(repeats):
+            batch, camera = self._batch(count, scenes), cameras[number % len(cameras)]
+            start = time.perf_counter()
+            self._ours.render(batch, (camera,), quality=quality)
+            times.append(time.perf_counter() - start)
+        ms = 1000 * float(np.median(times))
         return Cost(size, ms, ms / scenes)
 
     def _batch(self, count: int, scenes: int) -> SceneBatch:
@@ -357,34 +326,7 @@ class _Stage:
         return SceneState(self._names[:count], *self._arrangement(count))
 
     def _arrangement(self, count: int) -> tuple[Pose, Light, Float[np.ndarray, "3"]]:
-        """A new scene: poses, light, pusher."""
+        """Draw poses, light and pusher of a new scene."""
         poses = lay_out([self._assets[name] for name in self._names[:count]], self._rng)
         pusher = np.array([*self._rng.uniform(-_REACH_M, _REACH_M, 2), PUSHER_CENTRE_Z_M])
         return poses, Light.random(self._rng), pusher
-
-
-def _median_ms(prepare: Callable[[int], Any], work: Callable[[Any], object], repeats: int) -> float:
-    """Median time of the work, each time on something newly prepared [ms]."""
-    times = []
-    for number in range(repeats):
-        job = prepare(number)
-        start = time.perf_counter()
-        work(job)
-        times.append(time.perf_counter() - start)
-    return 1000 * float(np.median(times))
-
-
-def _part(batch: SceneBatch, scenes: np.ndarray) -> SceneBatch:
-    return replace(
-        batch,
-        positions=batch.positions[scenes],
-        quaternions=batch.quaternions[scenes],
-        lights=batch.lights[scenes],
-        pusher=None if batch.pusher is None else batch.pusher[scenes],
-    )
-
-
-def _threads() -> int:
-    import numba
-
-    return int(numba.get_num_threads())

@@ -1,4 +1,4 @@
-"""What rollouts cost: many sequences of actions among three objects, as a planner would ask for them."""
+"""Time rollouts: many sequences of actions among three objects, as a planner would ask for them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ import torch
 from jaxtyping import Float
 
 from osfcore.dynamics.dynamics_model import DynamicsModel
-from osfcore.dynamics.graph import PropagationNetwork
-from osfcore.dynamics.rollout import PushModel
 from osfcore.dynamics.shapes import ObjectShape
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -35,7 +33,7 @@ class RolloutCosts:
         rollout_s: median time of `SEQUENCES` sequences of `HORIZON` actions among three objects [s].
         rollout_steps_per_s: steps of scenes a second.
         touched_share: share of sequences in which something moves.
-        threads: that computed.
+        threads: number of threads that computed.
     """
 
     rollout_s: float
@@ -44,26 +42,14 @@ class RolloutCosts:
     threads: int
 
 
-def bench_rollouts(
-    network: PropagationNetwork, shapes: Mapping[str, ObjectShape], device: torch.device | str = "cpu"
-) -> RolloutCosts:
-    """Time rollouts of three objects, which stand around the pusher.
+def bench_rollouts(model: DynamicsModel, shapes: Mapping[str, ObjectShape]) -> RolloutCosts:
+    """Time rollouts of three objects that stand around the pusher.
 
     Args:
-        network: what is timed; it stays on the device.
+        model: predicts, and knows these objects.
         shapes: by name; the first three names are taken.
-        device: that computes.
-
-    Raises:
-        InvalidInput: if there are no shapes.
     """
-    names = tuple(sorted(shapes))[: len(BENCH_NAMES)]
-    return _timed(PushModel(network, {name: shapes[name] for name in names}, device), shapes)
-
-
-def _timed(model: DynamicsModel, shapes: Mapping[str, ObjectShape]) -> RolloutCosts:
-    names = tuple(sorted(shapes))[: len(BENCH_NAMES)]
-    state, actions = _scene(names, shapes), _paths(stream_rng(0, Stream.BENCHMARK))
+    state, actions = _scene(tuple(sorted(shapes))[: len(BENCH_NAMES)], shapes), _paths()
     rollouts = model.rollout(state, actions)  # warm
     seconds = []
     for _ in range(_REPEATS):
@@ -75,18 +61,8 @@ def _timed(model: DynamicsModel, shapes: Mapping[str, ObjectShape]) -> RolloutCo
     return RolloutCosts(median, SEQUENCES * HORIZON / median, float(moved.mean()), torch.get_num_threads())
 
 
-def rollout_rate(model: DynamicsModel, shapes: Mapping[str, ObjectShape]) -> float:
-    """Steps of three-object scenes predicted in a second.
-
-    Args:
-        model: that predicts, and knows these objects.
-        shapes: by name; the first three names are taken.
-    """
-    return _timed(model, shapes).rollout_steps_per_s
-
-
 def _scene(names: tuple[str, ...], shapes: Mapping[str, ObjectShape]) -> SceneState:
-    """Objects upright around the pusher, close enough that most paths meet one."""
+    """Return objects upright around the pusher, close enough that most paths meet one."""
     angles = 2 * np.pi * np.arange(len(names)) / len(names)
     heights = [float(-shapes[name].support[:, 2].min() - shapes[name].centre[2]) for name in names]
     away = [_RING_M + float(shapes[name].half_extents[:2].max()) for name in names]
@@ -95,8 +71,9 @@ def _scene(names: tuple[str, ...], shapes: Mapping[str, ObjectShape]) -> SceneSt
     return SceneState(names, poses, Light(np.array([0.0, 0.0, 1.0])), np.array([0.0, 0.0, PUSHER_CENTRE_Z_M]))
 
 
-def _paths(rng: np.random.Generator) -> Float[np.ndarray, "K T 3"]:
-    """Smooth random velocities: a few knots, joined by lines."""
+def _paths() -> Float[np.ndarray, "K T 3"]:
+    """Return smooth random velocities: a few knots, joined by lines [m/s]."""
+    rng = stream_rng(0, Stream.BENCHMARK)
     knots = rng.uniform(-MAX_SPEED_M_S, MAX_SPEED_M_S, (SEQUENCES, _KNOTS, 2))
     at = np.linspace(0, _KNOTS - 1, HORIZON)
     low = np.minimum(at.astype(int), _KNOTS - 2)

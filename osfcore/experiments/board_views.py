@@ -1,4 +1,4 @@
-"""Synthetic photographs of a printed board or tag, and how far the camera that is found in them is from the true one.
+"""Synthetic photographs of a printed board, and how far the camera that is found in them is from the true one.
 
 A view is drawn in linear light with 3 x 3 samples a pixel: the print on a table of a random colour, blurred and lit
 unevenly; it is then encoded as sRGB, gets noise and is stored as JPEG, as a camera would do.
@@ -8,27 +8,18 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp, rotation_angle
 from osfcore.io.image_file import to_uint8
-from osfcore.photo.board import (
-    TAG_DICTIONARY,
-    Board,
-    BoardView,
-    locate_board,
-    locate_tag,
-    marker_dictionary,
-    page_image,
-)
+from osfcore.photo.board import Board, BoardView, locate_board, page_image
 from osfcore.photo.lens import locate_board_through_lens
 
 _DISTANCES_M = (0.4, 1.0)
@@ -63,7 +54,7 @@ class Photograph:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ViewErrors:
-    """How far cameras that were found are from the true ones, view by view; NaN where none was found.
+    """Errors of cameras that were found, view by view; NaN where none was found.
 
     Attributes:
         rotation_rad: angle between the orientations [rad].
@@ -71,9 +62,9 @@ class ViewErrors:
         nearby_m: the largest such distance of points on the table within 20 cm of the centre [m].
         camera_m: distance between the camera's positions in the print's frame [m].
         focal_share: error of the focal length, as a share of it.
-        rms_px: reprojection error that was told [px].
+        rms_px: reprojection error, as `locate_board` reports it [px].
         corners: number of points that were found.
-        refusals: what was said instead, of each view; empty where a camera was found.
+        refusals: why no camera was found, of each view; empty where one was.
     """
 
     rotation_rad: Float[np.ndarray, "views"]
@@ -92,7 +83,7 @@ def random_camera(
     distances_m: tuple[float, float] = _DISTANCES_M,
     elevations_deg: tuple[float, float] = _ELEVATIONS_DEG,
 ) -> tuple[Pose, Float[np.ndarray, "3 3"]]:
-    """The pose `T_world_camera` and the intrinsics of a camera that looks at a print, from any side.
+    """Draw the pose `T_world_camera` and the intrinsics of a camera that looks at a print, from any side.
 
     Args:
         rng: draws it.
@@ -109,30 +100,31 @@ def random_camera(
     return level @ roll, np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
 
 
-def photograph(
-    paper: Bool[np.ndarray, "h w"],
-    pixels_per_m: float,
-    camera: tuple[Pose, Float[np.ndarray, "3 3"]],
-    size: tuple[int, int],
+def board_photograph(
     rng: np.random.Generator,
+    size: tuple[int, int],
+    board: Board | None = None,
+    camera: tuple[Pose, Float[np.ndarray, "3 3"]] | None = None,
     blur_px: float = _BLUR_PX,
     radial: float = 0.0,
 ) -> Photograph:
-    """A photograph of a print that lies on a table, its centre at the origin and its top along +y.
+    """Take a photograph of a page with a board that lies on a table, its centre at the origin and its top along +y.
 
     Args:
-        paper: the print: what is paper, not ink.
-        pixels_per_m: its resolution.
-        camera: its pose `T_world_camera` and intrinsics.
+        rng: draws the camera if none is given, the table, the light and the noise.
         size: width and height of the photograph [px].
-        rng: draws the table, the light and the noise.
+        board: on the page; the default one if not given.
+        camera: its pose `T_world_camera` and intrinsics.
         blur_px: standard deviation of the lens's blur [px].
         radial: k1 of the lens, as OpenCV counts it; negative for a barrel.
     """
+    pose, intrinsics = camera or random_camera(rng, size)
+    pixels_per_m = _PAGE_STEP * math.ceil(4 * intrinsics[0, 0] / _DISTANCES_M[0] / _PAGE_STEP)
+    paper = page_image(board or Board(), pixels_per_m)  # what is paper, not ink
     width, height = size[0] * _SAMPLES, size[1] * _SAMPLES
-    warp = _raster_to_image(paper.shape, pixels_per_m, *camera)
+    warp = _raster_to_image(paper.shape, pixels_per_m, pose, intrinsics)
     ink, white = _REFLECTANCES
-    lens = _lens(size, camera[1], radial)
+    lens = _lens(size, intrinsics, radial)
     cover = _seen(np.ones(paper.shape, np.float32), warp, (width, height), lens)
     print_light = _seen((ink + (white - ink) * paper).astype(np.float32), warp, (width, height), lens)
     texture = rng.uniform(0.6, 1.4, (24, 32)).astype(np.float32)
@@ -144,32 +136,7 @@ def photograph(
     values += rng.normal(0, _NOISE, values.shape)
     file = io.BytesIO()
     Image.fromarray(to_uint8(values)).save(file, "JPEG", quality=_JPEG_QUALITY)
-    return Photograph(np.array(Image.open(file)), *camera)
-
-
-def tag_print(
-    side_m: float, number: int = 0, dictionary: str = TAG_DICTIONARY
-) -> tuple[Bool[np.ndarray, "h w"], float]:
-    """A tag in the middle of a white sheet twice as large, and its resolution [pixels per m]."""
-    known = marker_dictionary(dictionary)
-    pixels = 24 * (known.markerSize + 2)
-    tag = np.asarray(cv2.aruco.generateImageMarker(known, number, pixels)) > 0
-    return np.pad(tag, pixels // 2, constant_values=True), pixels / side_m
-
-
-def board_photograph(
-    rng: np.random.Generator,
-    size: tuple[int, int],
-    board: Board | None = None,
-    camera: tuple[Pose, Float[np.ndarray, "3 3"]] | None = None,
-    blur_px: float = _BLUR_PX,
-    radial: float = 0.0,
-) -> Photograph:
-    """A photograph of the page with a board on it, by a random camera if none is given."""
-    pose, intrinsics = camera or random_camera(rng, size)
-    resolution = _PAGE_STEP * math.ceil(4 * intrinsics[0, 0] / _DISTANCES_M[0] / _PAGE_STEP)
-    page = page_image(board or Board(), resolution)
-    return photograph(page, resolution, (pose, intrinsics), size, rng, blur_px, radial)
+    return Photograph(np.array(Image.open(file)), pose, intrinsics)
 
 
 def board_errors(
@@ -181,51 +148,37 @@ def board_errors(
     board: Board | None = None,
     radial: float | None = None,
 ) -> ViewErrors:
-    """Errors of cameras found with the board, in random views.
+    """Return the errors of cameras found with the board, in random views.
 
     Args:
         count: of views.
         rng: draws them.
         size: width and height of the photographs [px].
-        is_focal_known: whether the intrinsics are told.
+        is_focal_known: whether the intrinsics are given.
         board: that lies on the table; the default one if not given.
         radial: k1 of a lens, which is looked for as well; None for a lens without distortion that is taken for such.
     """
     board = board or Board()
-
-    def locate(view: Photograph) -> BoardView:
-        intrinsics = view.intrinsics if is_focal_known else None
-        if radial is None:
-            return locate_board(view.image, board, intrinsics)
-        return locate_board_through_lens(view.image, board, intrinsics)[0]
-
-    return _errors((board_photograph(rng, size, board, radial=radial or 0.0) for _ in range(count)), locate)
-
-
-def tag_errors(count: int, rng: np.random.Generator, size: tuple[int, int], *, side_m: float = 0.08) -> ViewErrors:
-    """Errors of cameras found with an AprilTag of the family 36h11, in random views; see `board_errors`."""
-    paper, resolution = tag_print(side_m)
-    return _errors(
-        (photograph(paper, resolution, random_camera(rng, size), size, rng) for _ in range(count)),
-        lambda view: locate_tag(view.image, side_m, view.intrinsics),
-    )
-
-
-def _errors(photographs: Iterable[Photograph], locate: Callable[[Photograph], BoardView]) -> ViewErrors:
     rows, refusals = [], []
-    for view in photographs:
+    for _ in range(count):
+        view = board_photograph(rng, size, board, radial=radial or 0.0)
+        intrinsics = view.intrinsics if is_focal_known else None
         try:
-            rows.append(_error(locate(view), view))
+            if radial is None:
+                found = locate_board(view.image, board, intrinsics)
+            else:
+                found = locate_board_through_lens(view.image, board, intrinsics)[0]
+            rows.append(_error(found, view))
             refusals.append("")
         except InvalidInput as refusal:
             rows.append(np.full(7, np.nan))
             refusals.append(str(refusal))
     table = np.array(rows).reshape(-1, 7)
-    return ViewErrors(*(table[:, i] for i in range(7)), refusals=tuple(refusals))
+    return ViewErrors(*table.T, refusals=tuple(refusals))
 
 
 def _error(found: BoardView, true: Photograph) -> Float[np.ndarray, "7"]:
-    """The figures of `ViewErrors`, in their order."""
+    """Return the figures of `ViewErrors`, in their order."""
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     around = _NEARBY_M * np.stack([np.cos(angles), np.sin(angles), np.zeros(12)], axis=1)
     points = np.concatenate([np.zeros((1, 3)), around])
@@ -251,7 +204,7 @@ def _seen(
     size: tuple[int, int],
     lens: Float[np.ndarray, "h w 2"] | None,
 ) -> Float[np.ndarray, "h w"]:
-    """A flat layer as a camera of this finely sampled size sees it, through its lens."""
+    """Return a flat layer as a camera of this finely sampled size sees it through its lens."""
     if lens is None:
         return cv2.warpPerspective(layer, warp, size)
     low = np.floor(np.minimum(lens.min(axis=(0, 1)), 0))
@@ -264,7 +217,7 @@ def _seen(
 def _lens(
     size: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"], radial: float
 ) -> Float[np.ndarray, "h w 2"] | None:
-    """For each sample of the image the place where it would be without distortion [samples]; None without any."""
+    """Return for each sample of the image its place without distortion [samples]; None where there is none."""
     if radial == 0:
         return None
     fine = np.diag([_SAMPLES, _SAMPLES, 1.0]) @ intrinsics
@@ -280,7 +233,7 @@ def _lens(
 def _raster_to_image(
     shape: tuple[int, ...], pixels_per_m: float, pose: Pose, intrinsics: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """From indices of a print's pixels to those of the finely sampled image, as OpenCV counts them."""
+    """Return the homography from a print's pixels to the finely sampled image, both as OpenCV counts them."""
     world_to_camera = pose.inverse().matrix()[:3]
     height, width = shape
     to_table = np.array([[1, 0, -width / 2], [0, -1, height / 2], [0, 0, pixels_per_m]]) / pixels_per_m
@@ -290,12 +243,12 @@ def _raster_to_image(
 
 
 def _reduced(layer: Float[np.ndarray, "H W"], size: tuple[int, int], blur_px: float) -> Float[np.ndarray, "h w"]:
-    """What falls on each pixel behind a lens."""
+    """Blur a finely sampled layer by the lens, and average it over each pixel."""
     return cv2.resize(cv2.GaussianBlur(layer, (0, 0), blur_px * _SAMPLES), size, interpolation=cv2.INTER_AREA)
 
 
 def _lighting(size: tuple[int, int], rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
-    """Exposure, which falls off linearly across the image in some direction."""
+    """Draw exposure, which falls off linearly across the image in some direction."""
     slopes, exposure = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.5, 1.05)
     across = (np.arange(size[0]) + 0.5) / size[0] - 0.5
     down = (np.arange(size[1]) + 0.5) / size[1] - 0.5

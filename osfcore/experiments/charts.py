@@ -6,23 +6,17 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import OsfError
+from osfcore.extras import need
 from osfcore.io.files import write_atomically
 
 _PANEL_IN = (4.6, 3.4)  # width and height
 _BARS_IN = (6.4, 0.28)  # width, and height of each bar
 _SHADE = 0.15
-
-
-class MissingMatplotlib(OsfError):
-    """Charts cannot be drawn."""
-
-    def __init__(self) -> None:
-        super().__init__("Charts need matplotlib; install it with: pip install 'osf-manipulation[experiments]'.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -31,9 +25,9 @@ class Curve:
 
     Attributes:
         name: in the legend.
-        x: where.
-        y: what; gaps where it is NaN.
-        dots: also mark the points.
+        x: places.
+        y: values; the line has gaps where they are NaN.
+        dots: whether the points are marked.
         band: lower and upper end of an interval around each y, drawn as a shade.
     """
 
@@ -73,29 +67,14 @@ class Bar:
     high: float
 
 
-def check_matplotlib() -> None:
-    """Check that charts can be drawn.
-
-    Raises:
-        MissingMatplotlib: if they cannot.
-    """
-    try:
-        import matplotlib  # noqa: F401  an extra, not among what every installation has
-    except ImportError:
-        raise MissingMatplotlib from None
-
-
 def write_charts(path: Path, charts: Sequence[Chart]) -> None:
     """Draw charts in a row as PNG.
 
     Raises:
         CannotWrite: if the disk refuses.
-        MissingMatplotlib: if it is not installed.
+        MissingExtra: if matplotlib is not installed.
     """
-    check_matplotlib()
-    from matplotlib.figure import Figure
-
-    figure = Figure((_PANEL_IN[0] * len(charts), _PANEL_IN[1]), layout="constrained")
+    figure = _figure(_PANEL_IN[0] * len(charts), _PANEL_IN[1])
     panels = np.atleast_1d(figure.subplots(1, len(charts)))
     for panel, chart in zip(panels, charts, strict=True):
         for curve in chart.curves:
@@ -108,9 +87,7 @@ def write_charts(path: Path, charts: Sequence[Chart]) -> None:
         panel.grid(alpha=0.3)
         if chart.curves:
             panel.legend(fontsize="small")
-    picture = io.BytesIO()
-    figure.savefig(picture)
-    write_atomically(path, picture.getvalue())
+    _write(path, figure)
 
 
 def write_bars(path: Path, title: str, axis: Axis, bars: Sequence[Bar]) -> None:
@@ -118,12 +95,9 @@ def write_bars(path: Path, title: str, axis: Axis, bars: Sequence[Bar]) -> None:
 
     Raises:
         CannotWrite: if the disk refuses.
-        MissingMatplotlib: if it is not installed.
+        MissingExtra: if matplotlib is not installed.
     """
-    check_matplotlib()
-    from matplotlib.figure import Figure
-
-    figure = Figure((_BARS_IN[0], 1.0 + _BARS_IN[1] * len(bars)), layout="constrained")
+    figure = _figure(_BARS_IN[0], 1.0 + _BARS_IN[1] * len(bars))
     panel = figure.subplots()
     values = np.array([bar.value for bar in bars])
     ends = np.array([[bar.value - bar.low, bar.high - bar.value] for bar in bars]).reshape(-1, 2).T.clip(min=0)
@@ -133,19 +107,31 @@ def write_bars(path: Path, title: str, axis: Axis, bars: Sequence[Bar]) -> None:
     panel.set(title=title, xlabel=axis.label)
     panel.set_xlim(axis.low, axis.high)
     panel.grid(axis="x", alpha=0.3)
+    _write(path, figure)
+
+
+def _figure(width: float, height: float) -> Any:  # noqa: ANN401 - of matplotlib, an extra
+    """Return an empty figure of a size [inch]."""
+    need("experiments", "A chart")
+    from matplotlib.figure import Figure
+
+    return Figure((width, height), layout="constrained")
+
+
+def _write(path: Path, figure: Any) -> None:  # noqa: ANN401
     picture = io.BytesIO()
     figure.savefig(picture)
     write_atomically(path, picture.getvalue())
 
 
 def cumulative(name: str, values: Sequence[float], axis: Axis, total: int | None = None) -> Curve:
-    """The share of values up to each place on an axis.
+    """Return the share of values up to each place on an axis.
 
     Args:
         name: in the legend.
         values: any numbers.
         axis: over which it is drawn; has both ends.
-        total: what is 1; the number of values if None. More where some have no value.
+        total: count that is a share of 1; the number of values if None. It is more where some have no value.
     """
     places = np.linspace(axis.low, axis.high or 0.0, 200)
     below = np.searchsorted(np.sort(np.asarray(values, float)), places, side="right")

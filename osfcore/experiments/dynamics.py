@@ -1,4 +1,4 @@
-"""How good predictions of pushes are: open loop over episodes that nothing was trained on.
+"""Measure predictions of pushes: open loop over episodes that nothing was trained on.
 
 Episodes of both policies with two, three, four and six objects are collected once into the output folder, from random
 streams that no other collection uses. Windows of up to 30 actions are rolled out by the network, by a quasi-static
@@ -14,12 +14,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from osfcore.dynamics.dynamics_model import DynamicsModel
@@ -28,8 +28,8 @@ from osfcore.dynamics.motion import SUBSTEPS, pusher_path
 from osfcore.dynamics.rollout import PushModel, load_shapes, network_path
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable, part_outlines
 from osfcore.dynamics.train import has_held_out_pair
-from osfcore.errors import InvalidInput, MissingAssets, check_seed
-from osfcore.experiments.bench_rollouts import BENCH_NAMES, rollout_rate
+from osfcore.errors import InvalidInput
+from osfcore.experiments.bench_rollouts import BENCH_NAMES, bench_rollouts
 from osfcore.experiments.charts import Axis, Chart, Curve, write_charts
 from osfcore.experiments.dynamics_scores import (
     HORIZONS,
@@ -43,6 +43,7 @@ from osfcore.experiments.dynamics_scores import (
     learned,
     windows_of,
 )
+from osfcore.experiments.harness import EvaluationStep, check_run, chosen_objects
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
@@ -61,39 +62,27 @@ from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 
 DynamicsMethod = Literal["ours", "paper"]
 METHODS: tuple[DynamicsMethod, ...] = get_args(DynamicsMethod)
-_CHUNK = 512  # windows
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Predictor:
+class Predictor(NamedTuple):
     """One way to predict.
 
     Attributes:
-        predict: poses in windows of episodes, told the poses of one action before the start.
-        model: the same as planning asks for it.
+        predict: gives poses in windows of episodes; it may use the poses of one action before the start.
+        model: the same as planning uses it.
     """
 
     predict: Callable[[Windows], Predicted]
     model: DynamicsModel
 
 
-def check_method(method: str) -> None:
-    """Refuse what is no method.
-
-    Raises:
-        InvalidInput: if it is none.
-    """
-    if method not in METHODS:
-        raise InvalidInput("method", repr(method), f"one of {', '.join(METHODS)}")
-
-
 def load_predictor(
     method: DynamicsMethod, data_dir: Path | None, fields: FieldLibrary, shapes: Mapping[str, ObjectShape]
 ) -> Predictor:
-    """A trained network, on the CPU.
+    """Load a trained network, on the CPU.
 
     Args:
-        method: whose.
+        method: whose network.
         data_dir: a network in it comes before the package's.
         fields: of the objects.
         shapes: of all objects that occur, by name.
@@ -109,27 +98,23 @@ def load_predictor(
 
 
 def as_published(network: GraphNetwork, kappas: Mapping[str, float], windows: Windows) -> Predicted:
-    """Predictions of the paper's network, which looks at the poses at the start alone.
+    """Predict by the paper's network, which looks at the poses at the start alone.
 
     Args:
         network: on the CPU.
         kappas: longest axes of all objects in the windows, by name [m].
         windows: what to predict.
     """
-    number = torch.tensor([[network.number(name) for name in row] for row in windows.names])
-    kappa = torch.tensor([[kappas[name] for name in row] for row in windows.names])
-    path = pusher_path(windows.pusher[:, 1, :2], windows.actions[..., :2])[:, ::SUBSTEPS]
-    height = np.broadcast_to(windows.pusher[:, 1:2, 2:], (*path.shape[:2], 1))
-    pusher = _tensor(np.concatenate([path, height], axis=-1))
-    start = Scenes(_tensor(windows.positions[:, 1]), _tensor(windows.quaternions[:, 1]), pusher[:, 0])
-    placed: list[np.ndarray] = []
-    turned: list[np.ndarray] = []
-    with torch.inference_mode():
-        for first in range(0, len(number), _CHUNK):
-            rows = slice(first, first + _CHUNK)
-            begin = Scenes(start.position[rows], start.quaternion[rows], start.pusher[rows])
-            actions = _tensor(windows.actions[rows])
-            scenes = list(unroll(network, number[rows], kappa[rows], begin, actions, pusher[rows]))
+    placed, turned = [], []
+    for part in windows.chunks():
+        number = torch.tensor([[network.number(name) for name in row] for row in part.names])
+        kappa = torch.tensor([[kappas[name] for name in row] for row in part.names])
+        path = pusher_path(part.pusher[:, 1, :2], part.actions[..., :2])[:, ::SUBSTEPS]
+        height = np.broadcast_to(part.pusher[:, 1:2, 2:], (*path.shape[:2], 1))
+        pusher = _tensor(np.concatenate([path, height], axis=-1))
+        start = Scenes(_tensor(part.positions[:, 1]), _tensor(part.quaternions[:, 1]), pusher[:, 0])
+        with torch.inference_mode():
+            scenes = list(unroll(network, number, kappa, start, _tensor(part.actions), pusher))
             placed.append(torch.stack([s.position for s in scenes], dim=1).numpy())
             turned.append(torch.stack([s.quaternion for s in scenes], dim=1).numpy())
     return Predicted(np.concatenate(placed).astype(float), np.concatenate(turned).astype(float))
@@ -142,7 +127,7 @@ def _tensor(array: np.ndarray) -> Tensor:
 # What the evaluation of predicted pushes amounts to.
 
 
-_TOLD = (1, 4, 10, 30)
+_REPORTED = (1, 4, 10, 30)  # horizons
 _DIGITS = 3
 
 
@@ -179,53 +164,46 @@ class DynamicsReport:
     rollout_steps_per_s: float
     holds_out_pairs: bool = True
 
+    @property
+    def counts(self) -> list[int]:
+        """Numbers of objects in a scene, ascending."""
+        return sorted({int(key.split()[1]) for key in self.by_set})
+
     def of_count(self, objects: int) -> list[Scored]:
-        """Both policies with that many objects."""
+        """Return the sets of both policies with that many objects."""
         return [scored for key, scored in self.by_set.items() if key.endswith(f" {objects}")]
 
 
 def report_json(report: DynamicsReport) -> dict[str, Any]:
-    """The report as plain numbers: millimetres and degrees; null for what was not measured."""
+    """Return the report as plain numbers: millimetres and degrees; null for what was not measured."""
     main = report.of_count(3)
-    result: dict[str, Any] = {"windows": _windows(main, 4)}
-    for horizon in _TOLD:
-        result |= _figures(main, horizon)
+    result: dict[str, Any] = {"windows": len(_moved(main, "network", 4))}
+    for horizon in _REPORTED:
+        mm, deg = (_moved(main, "network", horizon, deg=deg) for deg in (False, True))
+        result |= {f"median_mm_{horizon}": _median(mm), f"median_deg_{horizon}": _median(deg)}
+        result |= {f"mean_mm_{horizon}": _mean(mm), f"mean_deg_{horizon}": _mean(deg), f"windows_{horizon}": len(mm)}
     still = np.concatenate([scored.errors["network"].of_still(LONGEST) for scored in main])
-    result["still_drift_mm_30"] = _rounded(np.mean(still)) if len(still) else None
-    result["still_drift_median_mm_30"] = _median([still])
+    result |= {"still_drift_mm_30": _mean(still), "still_drift_median_mm_30": _median(still)}
     result["still_windows_30"] = len(still)
-    for horizon in _TOLD:
+    for horizon in _REPORTED:
         result[f"constant_mm_{horizon}"] = _median(_moved(main, "constant", horizon))
         result[f"analytic_mm_{horizon}"] = _median(_moved(main, "analytic", horizon))
         result[f"analytic_deg_{horizon}"] = _median(_moved(main, "analytic", horizon, deg=True))
     result["rollout_steps_per_s"] = round(report.rollout_steps_per_s)
-    result["by_objects"] = {str(count): _row(report.of_count(count)) for count in _counts(report)}
+    result["by_objects"] = {str(count): _row(report.of_count(count)) for count in report.counts}
     result["by_policy"] = {key.split()[0]: _row([s]) for key, s in report.by_set.items() if key.endswith(" 3")}
-    result["by_name"] = _by_name(main)
+    names = sorted({name for s in main for row in s.windows.names for name in row})
+    result["by_name"] = {name: _after_four(main, "network", lambda one, name=name: one == name) for name in names}
     result["unseen_pairs"] = _pairs(list(report.by_set.values()) if report.holds_out_pairs else [])
     return result | _unseen_figures(report)
 
 
-def _counts(report: DynamicsReport) -> list[int]:
-    return sorted({int(key.split()[1]) for key in report.by_set})
-
-
-def _figures(scored: Sequence[Scored], horizon: int) -> dict[str, Any]:
-    mm, deg = _moved(scored, "network", horizon), _moved(scored, "network", horizon, deg=True)
-    return {
-        f"median_mm_{horizon}": _median(mm),
-        f"median_deg_{horizon}": _median(deg),
-        f"mean_mm_{horizon}": _mean(mm),
-        f"mean_deg_{horizon}": _mean(deg),
-        f"windows_{horizon}": _windows(scored, horizon),
-    }
-
-
 def _row(scored: Sequence[Scored]) -> dict[str, Any]:
-    """The main figures of some sets."""
+    """Return the main figures of some sets."""
+    mm = _moved(scored, "network", 4)
     return {
-        "windows": _windows(scored, 4),
-        "median_mm_4": _median(_moved(scored, "network", 4)),
+        "windows": len(mm),
+        "median_mm_4": _median(mm),
         "median_deg_4": _median(_moved(scored, "network", 4, deg=True)),
         "median_mm_10": _median(_moved(scored, "network", 10)),
         "constant_mm_4": _median(_moved(scored, "constant", 4)),
@@ -233,77 +211,70 @@ def _row(scored: Sequence[Scored]) -> dict[str, Any]:
     }
 
 
-def _moved(scored: Sequence[Scored], who: str, horizon: int, *, deg: bool = False) -> list[Float[np.ndarray, "_"]]:
-    return [s.errors[who].of_moved(horizon, deg=deg) for s in scored]
+def _after_four(scored: Sequence[Scored], who: str, is_chosen: Callable[[str], bool]) -> dict[str, Any]:
+    """Return errors after four actions of objects with chosen names."""
 
+    def chosen(names: tuple[str, ...]) -> list[bool]:
+        return [is_chosen(name) for name in names]
 
-def _windows(scored: Sequence[Scored], horizon: int) -> int:
-    return sum(len(values) for values in _moved(scored, "network", horizon))
-
-
-def _by_name(scored: Sequence[Scored]) -> dict[str, Any]:
-    """Errors after four actions of each object."""
-    names = sorted({name for s in scored for row in s.windows.names for name in row})
-    rows = {}
-    for name in names:
-        mm, deg = (np.concatenate([_at(s, "network", _is(s, (name,)), deg=d) for s in scored]) for d in (False, True))
-        rows[name] = {"windows": len(mm), "median_mm_4": _median([mm]), "median_deg_4": _median([deg])}
-    return rows
+    mm, deg = (_moved(scored, who, 4, deg=deg, chosen=chosen) for deg in (False, True))
+    return {"windows": len(mm), "median_mm_4": _median(mm), "median_deg_4": _median(deg)}
 
 
 def _pairs(scored: Sequence[Scored]) -> dict[str, Any]:
-    """Scenes in which two objects meet that never do in training."""
-    masks = [_held_out(s) for s in scored]
-    mm = [_at(s, "network", mask) for s, mask in zip(scored, masks, strict=True)]
-    way = [_at(s, "constant", mask) for s, mask in zip(scored, masks, strict=True)]
-    return {"windows": sum(map(len, mm)), "median_mm_4": _median(mm), "constant_mm_4": _median(way)}
+    """Return errors in scenes in which two objects meet that never do in training."""
 
+    def chosen(names: tuple[str, ...]) -> list[bool]:
+        return [has_held_out_pair(names)] * len(names)
 
-def _held_out(scored: Scored) -> Bool[np.ndarray, "W N"]:
-    rows = np.array([has_held_out_pair(names) for names in scored.windows.names])
-    return np.repeat(rows[:, None], len(scored.windows.names[0]), axis=1)
+    mm, way = (_moved(scored, who, 4, chosen=chosen) for who in ("network", "constant"))
+    return {"windows": len(mm), "median_mm_4": _median(mm), "constant_mm_4": _median(way)}
 
 
 def _unseen_figures(report: DynamicsReport) -> dict[str, Any]:
-    """What it costs never to have seen an object: the same windows by both networks."""
-    if report.unseen is None:
-        return {"unseen_objects": [], "unseen_objects_mm_4": None, "unseen_objects_windows": 0,
-                "unseen_objects_deg_4": None, "seen_objects_mm_4": None, "seen_objects_deg_4": None}  # fmt: skip
-    chosen = _is(report.unseen, report.unseen_names)
-    mm = {who: _at(report.unseen, who, chosen) for who in ("without", "network")}
-    deg = {who: _at(report.unseen, who, chosen, deg=True) for who in ("without", "network")}
+    """Return what it costs never to have seen an object: errors in the same windows by both networks."""
+    scored = [] if report.unseen is None else [report.unseen]
+    without, seen = (_after_four(scored, who, report.unseen_names.__contains__) for who in ("without", "network"))
     return {
-        "unseen_objects": list(report.unseen_names),
-        "unseen_objects_windows": len(mm["without"]),
-        "unseen_objects_mm_4": _median([mm["without"]]),
-        "unseen_objects_deg_4": _median([deg["without"]]),
-        "seen_objects_mm_4": _median([mm["network"]]),
-        "seen_objects_deg_4": _median([deg["network"]]),
+        "unseen_objects": list(report.unseen_names if scored else ()),
+        "unseen_objects_windows": without["windows"],
+        "unseen_objects_mm_4": without["median_mm_4"],
+        "unseen_objects_deg_4": without["median_deg_4"],
+        "seen_objects_mm_4": seen["median_mm_4"],
+        "seen_objects_deg_4": seen["median_deg_4"],
     }
 
 
-def _is(scored: Scored, names: Sequence[str]) -> Bool[np.ndarray, "W N"]:
-    return np.array([[name in names for name in row] for row in scored.windows.names])
+def _moved(
+    scored: Sequence[Scored],
+    who: str,
+    horizon: int,
+    *,
+    deg: bool = False,
+    chosen: Callable[[tuple[str, ...]], list[bool]] | None = None,
+) -> Float[np.ndarray, "M"]:
+    """Return errors of one predictor for objects that truly moved, of all sets [mm or deg].
+
+    Args:
+        scored: the sets.
+        who: name of the predictor.
+        horizon: actions.
+        deg: errors of orientations instead of positions.
+        chosen: which objects of a window count, given their names; all if None.
+    """
+    parts = [np.zeros(0)]
+    for one in scored:
+        among = True if chosen is None else np.array([chosen(names) for names in one.windows.names])
+        parts.append(one.errors[who].of_moved(horizon, deg=deg, among=among))
+    return np.concatenate(parts)
 
 
-def _at(scored: Scored, who: str, chosen: Bool[np.ndarray, "W N"], *, deg: bool = False) -> Float[np.ndarray, "M"]:
-    """Errors after four actions of chosen objects that truly moved."""
-    errors, at = scored.errors[who], HORIZONS.index(4)
-    return (errors.deg if deg else errors.mm)[at][errors.moved[at] & errors.valid[at] & chosen]
+def _median(values: Float[np.ndarray, "M"]) -> float | None:
+    return round(float(np.median(values)), _DIGITS) if len(values) else None
 
 
-def _median(parts: Sequence[Float[np.ndarray, "_"]]) -> float | None:
-    values = np.concatenate(parts) if parts else np.zeros(0)
-    return _rounded(np.median(values)) if len(values) else None
-
-
-def _mean(parts: Sequence[Float[np.ndarray, "_"]]) -> float | None:
-    values = np.concatenate(parts) if parts else np.zeros(0)
-    return _rounded(np.mean(values)) if len(values) else None
-
-
-def _rounded(value: float | np.floating) -> float:
-    return round(float(value), _DIGITS)
+def _mean(values: Float[np.ndarray, "M"]) -> float | None:
+    return round(float(np.mean(values)), _DIGITS) if len(values) else None
 
 
 # Pictures of an evaluation of predicted pushes: errors by horizon, and trajectories seen from above.
@@ -327,18 +298,15 @@ def write_plots(folder: Path, report: DynamicsReport) -> None:
     for deg, label in ((False, "median position error [mm]"), (True, "median rotation error [deg]")):
         curves = [_curve(title, main, who, deg=deg) for who, title in names.items()]
         panels.append(_panel("Objects that moved, 3 in a scene", label, curves))
-    counts = sorted({int(key.split()[1]) for key in report.by_set})
-    curves = [_curve(f"{count} objects", report.of_count(count), "network", deg=False) for count in counts]
+    curves = [_curve(f"{count} objects", report.of_count(count), "network") for count in report.counts]
     panels.append(_panel("Graph network", "median position error [mm]", curves))
     write_charts(folder / "dynamics.png", panels)
 
 
-def _curve(name: str, scored: Sequence[Scored], who: str, *, deg: bool) -> Curve:
-    values = []
-    for horizon in HORIZONS:
-        errors = np.concatenate([s.errors[who].of_moved(horizon, deg=deg) for s in scored])
-        values.append(np.median(errors) if len(errors) else np.nan)
-    return Curve(name, np.array(HORIZONS, float), np.array(values), dots=True)
+def _curve(name: str, scored: Sequence[Scored], who: str, *, deg: bool = False) -> Curve:
+    values = [_moved(scored, who, horizon, deg=deg) for horizon in HORIZONS]
+    medians = [np.median(errors) if len(errors) else np.nan for errors in values]
+    return Curve(name, np.array(HORIZONS, float), np.array(medians), dots=True)
 
 
 def _panel(title: str, label: str, curves: Sequence[Curve]) -> Chart:
@@ -365,27 +333,17 @@ def write_gallery(folder: Path, report: DynamicsReport, shapes: Mapping[str, Obj
         ranked += [(float(worst[w]), scored, int(w)) for w in np.flatnonzero(worst >= 0)]
     ranked.sort(key=lambda entry: entry[0])
     middle = max((len(ranked) - _EACH) // 2, 0)
-    rows = [
-        _row_of_pictures(title, chosen, shapes)
-        for title, chosen in (
-            ("Best", ranked[:_EACH]),
-            ("Middle", ranked[middle : middle + _EACH]),
-            ("Worst", ranked[-_EACH:]),
-        )
-    ]
+    kinds = {"Best": ranked[:_EACH], "Middle": ranked[middle : middle + _EACH], "Worst": ranked[-_EACH:]}
+    blank = np.full((_CELL_PX, _CELL_PX, 3), _PAPER, np.uint8)
+    rows = []
+    for title, chosen in kinds.items():
+        cells = [_cell(f"{title}: {mm:.1f} mm", scored, window, shapes) for mm, scored, window in chosen]
+        rows.append(np.hstack([*cells, *[blank] * (_EACH - len(cells))]))
     write_png(folder / "trajectories.png", np.vstack(rows))
 
 
-def _row_of_pictures(
-    title: str, chosen: Sequence[tuple[float, Scored, int]], shapes: Mapping[str, ObjectShape]
-) -> np.ndarray:
-    cells = [_cell(f"{title}: {mm:.1f} mm", scored, window, shapes) for mm, scored, window in chosen]
-    blank = np.full((_CELL_PX, _CELL_PX, 3), _PAPER, np.uint8)
-    return np.hstack([*cells, *[blank] * (_EACH - len(cells))])
-
-
 def _cell(title: str, scored: Scored, window: int, shapes: Mapping[str, ObjectShape]) -> UInt8[np.ndarray, "h w 3"]:
-    """One window from above: where things were (grey), came to (green), were predicted to come to (red)."""
+    """Draw one window from above: starts (grey), true ends (green), predicted ends (red)."""
     cell = np.full((_CELL_PX, _CELL_PX, 3), _PAPER, np.uint8)
     windows, end = scored.windows, GALLERY_HORIZON
     pusher = windows.pusher[window, 1 : end + 2, :2]
@@ -424,11 +382,11 @@ def _cell(title: str, scored: Scored, window: int, shapes: Mapping[str, ObjectSh
 
 
 REPORT_FILE = "dynamics.json"
-MAX_TASKS = 10_000
 COUNTS = (2, 3, 4, 6)  # objects in a scene
 _STEPS = 50
 _OTHERS = 2  # objects beside unseen ones
 _UNSEEN = "unseen"
+_SECOND_NETWORK = "pushes_without_two"
 
 
 @dataclass(frozen=True, slots=True)
@@ -457,29 +415,11 @@ class EvaluateDynamics:
         return self.folder if self.method == "ours" else self.folder / self.method
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class DynamicsEvaluationStep:
-    """How far an evaluation is.
-
-    Attributes:
-        done: parts finished.
-        total: parts in all.
-        note: what is being done.
-        report: with the last step only.
-    """
-
-    done: int
-    total: int
-    note: str
-    report: dict[str, Any] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Set:
-    """Episodes of one kind."""
+class _Set(NamedTuple):
+    """Episodes of one kind; the key names their policy and number of objects."""
 
     key: str
-    policy: str
+    policy: Literal["directed", "paper"]
     objects: int
     episodes: int
     names: tuple[str, ...]
@@ -487,7 +427,7 @@ class _Set:
 
 def evaluate_dynamics(
     config: EvaluateDynamics, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[DynamicsEvaluationStep]:
+) -> Iterator[EvaluationStep[dict[str, Any]]]:
     """Collect, predict and score; pictures and dynamics.json go to `config.results`.
 
     Args:
@@ -505,59 +445,48 @@ def evaluate_dynamics(
     unseen = _unseen(config, names)
     sets = _sets(config, names, unseen)
     total = 2 * len(sets) + 1
-    done = 0
-    for entry in sets:
-        for step in _collect(config, entry, assets, executor):
-            yield DynamicsEvaluationStep(done, total, f"Pushes, {entry.objects} objects: {step}")
-        done += 1
+    for done, entry in enumerate(sets):
+        for note in _collect(config, entry, assets, executor):
+            yield EvaluationStep(done, total, f"Pushes, {entry.objects} objects: {note}")
     shapes = load_shapes(config.data_dir, fields, names)
     predictor = load_predictor(config.method, config.data_dir, fields, shapes)
     scored: dict[str, Scored] = {}
-    for entry in sets:
-        yield DynamicsEvaluationStep(done, total, f"Predicting {entry.policy} pushes of {entry.objects} objects")
+    for done, entry in enumerate(sets, len(sets)):
+        yield EvaluationStep(done, total, f"Predicting {entry.policy} pushes of {entry.objects} objects")
         scored[entry.key] = _score(config, entry, shapes, assets, predictor)
-        done += 1
-    yield DynamicsEvaluationStep(done, total, "Timing rollouts")
+    yield EvaluationStep(total - 1, total, "Timing rollouts")
     bench_shapes = load_shapes(config.data_dir, fields, BENCH_NAMES)
     timed = load_predictor(config.method, config.data_dir, fields, bench_shapes).model
     report = DynamicsReport(
         by_set={key: value for key, value in scored.items() if key != _UNSEEN},
         unseen=scored.get(_UNSEEN),
         unseen_names=unseen,
-        rollout_steps_per_s=rollout_rate(timed, bench_shapes),
+        rollout_steps_per_s=bench_rollouts(timed, bench_shapes).rollout_steps_per_s,
         holds_out_pairs=config.method == "ours",
     )
     write_plots(config.results, report)
     write_gallery(config.results, report, shapes)
     figures = report_json(report)
     write_json(config.results / REPORT_FILE, figures)
-    yield DynamicsEvaluationStep(total, total, "Everything is measured", figures)
+    yield EvaluationStep(total, total, "Everything is measured", figures)
 
 
 def _checked(config: EvaluateDynamics, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    """The objects; at least as many as the largest scene of three policies needs."""
-    if not 1 <= config.tasks <= MAX_TASKS:
-        raise InvalidInput("number of tasks", config.tasks, f"between 1 and {MAX_TASKS}")
-    check_seed(config.seed)
-    check_method(config.method)
-    if config.names is None:
-        names = tuple(name for name in fields.names() if assets.has(name))
-    else:
-        for name in config.names:
-            fields.info(name)
-            if not assets.has(name):
-                raise MissingAssets([name])
-        names = tuple(sorted(set(config.names)))
+    """Check everything, and return the objects."""
+    check_run(config.tasks, config.seed)
+    if config.method not in METHODS:
+        raise InvalidInput("method", repr(config.method), f"one of {', '.join(METHODS)}")
+    names = tuple(sorted(chosen_objects(config.names, fields, assets)))
     if len(names) < min(COUNTS) + 1:
         raise InvalidInput("number of objects with a field and a mesh", len(names), f"at least {min(COUNTS) + 1}")
     return names
 
 
 def _unseen(config: EvaluateDynamics, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Objects that the second shipped network has not seen, as far as they are there; the paper's has no second one."""
+    """Return objects that the second shipped network has not seen, as far as they are there; the paper's has none."""
     if config.method != "ours":
         return ()
-    return tuple(name for name in read_metrics(shipped("pushes_without_two")).get("without", ()) if name in names)
+    return tuple(name for name in read_metrics(shipped(_SECOND_NETWORK)).get("without", ()) if name in names)
 
 
 def _sets(config: EvaluateDynamics, names: tuple[str, ...], unseen: tuple[str, ...]) -> list[_Set]:
@@ -573,16 +502,14 @@ def _sets(config: EvaluateDynamics, names: tuple[str, ...], unseen: tuple[str, .
 
 def _collect(config: EvaluateDynamics, entry: _Set, assets: AssetLibrary, executor: Executor | None) -> Iterator[str]:
     path = _path(config, entry)
-    if path.exists():
-        return
-    seed = stream_seed(config.seed, Stream.HELD_OUT_PUSHES, entry.objects, int(entry.policy == "paper"))
-    collection = CollectPushes(path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names)  # pyright: ignore[reportArgumentType]
-    for step in collect_pushes(collection, assets, executor):
-        yield step.note
+    if not path.exists():
+        seed = stream_seed(config.seed, Stream.HELD_OUT_PUSHES, entry.objects, int(entry.policy == "paper"))
+        collection = CollectPushes(path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names)
+        yield from (step.note for step in collect_pushes(collection, assets, executor))
 
 
 def _path(config: EvaluateDynamics, entry: _Set) -> Path:
-    """Where the episodes of a set are kept; the name tells all that they depend on, but for the simulator."""
+    """Return where the episodes of a set are kept; the name holds all that they depend on, but for the simulator."""
     which = hashlib.sha256(" ".join(entry.names).encode()).hexdigest()[:8]
     return config.folder / f"pushes-{entry.key.replace(' ', '-')}-{entry.episodes}-{config.seed}-{which}.h5"
 
@@ -592,13 +519,8 @@ def _score(
 ) -> Scored:
     windows = windows_of(read_pushes(_path(config, entry)))
     symmetries = {name: assets.info(name).symmetry for name in entry.names}
-    predictions = {
-        "network": predictor.predict(windows),
-        "constant": constant(windows),
-        "analytic": analytic(shapes, windows),
-    }
+    network = predictor.predict(windows)
+    predictions = {"network": network, "constant": constant(windows), "analytic": analytic(shapes, windows)}
     if entry.key == _UNSEEN:
-        predictions["without"] = learned(read_network(shipped("pushes_without_two")), shapes, windows)
-    return Scored(
-        windows, predictions["network"], {key: errors(windows, p, symmetries) for key, p in predictions.items()}
-    )
+        predictions["without"] = learned(read_network(shipped(_SECOND_NETWORK)), shapes, windows)
+    return Scored(windows, network, {key: errors(windows, p, symmetries) for key, p in predictions.items()})

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields
+from itertools import islice
 
 import numpy as np
 import torch
@@ -48,15 +48,15 @@ class Windows:
     actions: Float[np.ndarray, "W T 3"]
     on_table: Int[np.ndarray, "W"]
 
+    def chunks(self) -> Iterator[Windows]:
+        """Yield a few hundred windows at a time, to bound the memory that predictions take."""
+        for first in range(0, len(self.names), _CHUNK):
+            yield Windows(*(getattr(self, field.name)[first : first + _CHUNK] for field in fields(self)))
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Predicted:
-    """Poses after each action.
-
-    Attributes:
-        positions: of the objects [m].
-        quaternions: likewise.
-    """
+    """Poses of the objects after each action [m]."""
 
     positions: Float[np.ndarray, "W T N 3"]
     quaternions: Float[np.ndarray, "W T N 4"]
@@ -67,37 +67,38 @@ class Errors:
     """How far one predictor ends from the truth, for every horizon, window and object.
 
     Attributes:
-        mm: of position [mm].
-        deg: of orientation, by the object's symmetry [deg].
-        way_mm: how far the object truly went [mm].
-        moved: whether it truly moved.
+        mm: error of the position [mm].
+        deg: error of the orientation, by the object's symmetry [deg].
+        moved: whether the object truly moved.
         valid: whether everything was on the table up to then.
     """
 
     mm: Float[np.ndarray, "H W N"]
     deg: Float[np.ndarray, "H W N"]
-    way_mm: Float[np.ndarray, "H W N"]
     moved: Bool[np.ndarray, "H W N"]
     valid: Bool[np.ndarray, "H W N"]
 
-    def median(self, horizon: int, *, deg: bool = False) -> float | None:
-        """Of objects that truly moved; None if there are none."""
-        values = self.of_moved(horizon, deg=deg)
-        return float(np.median(values)) if len(values) else None
+    def of_moved(
+        self, horizon: int, *, deg: bool = False, among: Bool[np.ndarray, "W N"] | bool = True
+    ) -> Float[np.ndarray, "M"]:
+        """Return errors of objects that truly moved within so many actions [mm or deg].
 
-    def of_moved(self, horizon: int, *, deg: bool = False) -> Float[np.ndarray, "M"]:
-        """Errors of objects that truly moved within so many actions."""
+        Args:
+            horizon: one of `HORIZONS`.
+            deg: errors of orientations instead of positions.
+            among: objects that count.
+        """
         at = HORIZONS.index(horizon)
-        return (self.deg if deg else self.mm)[at][self.moved[at] & self.valid[at]]
+        return (self.deg if deg else self.mm)[at][self.moved[at] & self.valid[at] & among]
 
     def of_still(self, horizon: int) -> Float[np.ndarray, "M"]:
-        """Position errors of objects that did not [mm]."""
+        """Return position errors of objects that did not move [mm]."""
         at = HORIZONS.index(horizon)
         return self.mm[at][~self.moved[at] & self.valid[at]]
 
 
 def windows_of(episodes: Sequence[PushEpisode]) -> Windows:
-    """All windows of episodes of one length and number of objects."""
+    """Cut episodes of one length and number of objects into windows."""
     parts: list[tuple[object, ...]] = []
     for e in episodes:
         inside = is_on_table(e)
@@ -112,7 +113,7 @@ def windows_of(episodes: Sequence[PushEpisode]) -> Windows:
 
 
 def constant(windows: Windows) -> Predicted:
-    """Nothing ever moves."""
+    """Predict that nothing ever moves."""
     shape = (len(windows.names), LONGEST, windows.positions.shape[2])
     return Predicted(
         np.broadcast_to(windows.positions[:, 1:2], (*shape, 3)),
@@ -121,7 +122,7 @@ def constant(windows: Windows) -> Predicted:
 
 
 def learned(network: PropagationNetwork, shapes: Mapping[str, ObjectShape], windows: Windows) -> Predicted:
-    """Predictions of the network, told the poses of one action before the start.
+    """Predict by the network, which knows the poses of one action before the start.
 
     Args:
         network: on the CPU.
@@ -129,68 +130,57 @@ def learned(network: PropagationNetwork, shapes: Mapping[str, ObjectShape], wind
         windows: what to predict.
     """
 
-    def roll(scenes: _Scenes) -> Iterator[Motion]:
-        given = (network, scenes.table, scenes.number)
-        start = going_on(scenes.former, scenes.start)
-        for step, motion in enumerate(unroll(*given, start, scenes.velocity), start=1):
-            if step % SUBSTEPS == 0:
-                yield motion
+    def roll(table: ShapeTable, number: Tensor, part: Windows) -> Iterator[Motion]:
+        start = going_on(_at_rest(table, number, part, 0), _at_rest(table, number, part, 1))
+        velocity = torch.as_tensor(part.actions[..., :2], dtype=torch.float32).transpose(0, 1)
+        return islice(unroll(network, table, number, start, velocity), SUBSTEPS - 1, None, SUBSTEPS)
 
     return _rolled(shapes, windows, roll)
 
 
 def analytic(shapes: Mapping[str, ObjectShape], windows: Windows) -> Predicted:
-    """The quasi-static model."""
+    """Predict by the quasi-static model."""
 
-    def roll(scenes: _Scenes) -> Iterator[Motion]:
-        return push(scenes.table, scenes.number, scenes.start, scenes.shifts)
+    def roll(table: ShapeTable, number: Tensor, part: Windows) -> Iterator[Motion]:
+        shifts = torch.as_tensor(np.diff(part.pusher[:, 1:, :2], axis=1), dtype=torch.float32)
+        return push(table, number, _at_rest(table, number, part, 1), shifts.transpose(0, 1))
 
     return _rolled(shapes, windows, roll)
 
 
-class _Scenes(NamedTuple):
-    """Some windows as tensors: the scenes one action before their start and at it, and what the pusher does."""
-
-    table: ShapeTable
-    number: Tensor
-    former: Motion
-    start: Motion
-    velocity: Float[Tensor, "T B 2"]
-    shifts: Float[Tensor, "T B 2"]
-
-
 def _rolled(
-    shapes: Mapping[str, ObjectShape], windows: Windows, roll: Callable[[_Scenes], Iterator[Motion]]
+    shapes: Mapping[str, ObjectShape], windows: Windows, roll: Callable[[ShapeTable, Tensor, Windows], Iterator[Motion]]
 ) -> Predicted:
-    """Poses after each action, some windows at a time."""
+    """Return poses after each action.
+
+    Args:
+        shapes: of all objects in the windows, by name.
+        windows: what to predict.
+        roll: yields motions after each action of some windows, given a table of shapes and the objects' numbers in it.
+    """
     names = tuple(sorted(shapes))
     table = ShapeTable(tuple(shapes[name] for name in names))
-    number = torch.tensor([[names.index(name) for name in row] for row in windows.names])
-    centres: list[np.ndarray] = []
-    turned: list[np.ndarray] = []
+    centres, turned = [], []
     with torch.inference_mode():
-        for first in range(0, len(number), _CHUNK):
-            rows = slice(first, first + _CHUNK)
-            former, start = (_motion(table, number[rows], windows, rows, at) for at in (0, 1))
-            velocity = torch.as_tensor(windows.actions[rows, :, :2], dtype=torch.float32).transpose(0, 1)
-            shifts = torch.as_tensor(np.diff(windows.pusher[rows, 1:, :2], axis=1), dtype=torch.float32)
-            motions = list(roll(_Scenes(table, number[rows], former, start, velocity, shifts.transpose(0, 1))))
+        for part in windows.chunks():
+            number = torch.tensor([[names.index(name) for name in row] for row in part.names])
+            motions = list(roll(table, number, part))
             centres.append(torch.stack([motion.centre for motion in motions], dim=1).numpy())
             turned.append(torch.stack([motion.quaternion for motion in motions], dim=1).numpy())
     quaternions = np.concatenate(turned).astype(float)
-    offsets = np.array([shapes[name].centre for name in names])[number.numpy()][:, None]
+    offsets = np.array([[shapes[name].centre for name in row] for row in windows.names])[:, None]
     return Predicted(np.concatenate(centres) - rotate(quaternions, offsets), quaternions)
 
 
-def _motion(table: ShapeTable, number: Tensor, windows: Windows, rows: slice, at: int) -> Motion:
-    """The scenes at one instant, at rest."""
-    quaternion = torch.as_tensor(windows.quaternions[rows, at], dtype=torch.float32)
+def _at_rest(table: ShapeTable, number: Tensor, windows: Windows, at: int) -> Motion:
+    """Return the scenes one action before the start (at = 0) or at it (1), without velocities."""
+    quaternion = torch.as_tensor(windows.quaternions[:, at], dtype=torch.float32)
     offsets = table.centre[number].numpy()
-    centre = windows.positions[rows, at] + rotate(windows.quaternions[rows, at], offsets)
+    centre = windows.positions[:, at] + rotate(windows.quaternions[:, at], offsets)
     centre = torch.as_tensor(centre, dtype=torch.float32)
     lowest = lowest_point(table, number.flatten(), centre.flatten(0, 1), quaternion.flatten(0, 1)).view(number.shape)
     still = torch.zeros_like(centre)
-    pusher = torch.as_tensor(windows.pusher[rows, at, :2], dtype=torch.float32)
+    pusher = torch.as_tensor(windows.pusher[:, at, :2], dtype=torch.float32)
     return Motion(centre, quaternion, still, still, pusher, lowest.clamp(max=0))
 
 
@@ -205,23 +195,22 @@ def errors(windows: Windows, predicted: Predicted, symmetries: Mapping[str, Symm
     at = np.array(HORIZONS)
     true_p, true_q = (np.moveaxis(a[:, 1 + at], 1, 0) for a in (windows.positions, windows.quaternions))
     p, q = (np.moveaxis(a[:, at - 1], 1, 0) for a in (predicted.positions, predicted.quaternions))
-    way = 1e3 * np.linalg.norm(true_p - windows.positions[:, 1], axis=-1)
+    way_mm = 1e3 * np.linalg.norm(true_p - windows.positions[:, 1], axis=-1)
     start = np.broadcast_to(windows.quaternions[:, 1], true_q.shape)
-    turned = _angles(windows, symmetries, start, true_q)
+    turned_deg = _angles(windows, symmetries, start, true_q)
     valid = at[:, None] <= windows.on_table
     return Errors(
         mm=1e3 * np.linalg.norm(p - true_p, axis=-1),
         deg=_angles(windows, symmetries, q, true_q),
-        way_mm=way,
-        moved=(way > MOVED_MM) | (turned > MOVED_DEG),
-        valid=np.broadcast_to(valid[..., None], way.shape),
+        moved=(way_mm > MOVED_MM) | (turned_deg > MOVED_DEG),
+        valid=np.broadcast_to(valid[..., None], way_mm.shape),
     )
 
 
 def _angles(
     windows: Windows, symmetries: Mapping[str, Symmetry], a: Float[np.ndarray, "H W N 4"], b: np.ndarray
 ) -> Float[np.ndarray, "H W N"]:
-    """Symmetry-aware angles between orientations [deg]."""
+    """Return symmetry-aware angles between orientations [deg]."""
     angles = np.asarray(rotation_angle(a, b))
     for window, names in enumerate(windows.names):
         for slot, name in enumerate(names):

@@ -5,6 +5,10 @@ frames show it to four cameras with masks. Tracks follow 20 steps of pushes with
 the last one. Goals show some objects elsewhere under another light to the goal camera. Nothing of the truth ever
 reaches an estimator. Each finished part of a task is kept, so that an evaluation can be killed, resumed and run in
 pieces; pictures and report.json lie beside the kept results.
+
+Times are of estimates alone: fields are loaded and unpacked, code is compiled and the ways in which objects can
+lie are found in a warm-up on a scene that no figure uses, because all that is done once in a program's life. They
+are kept with the rest, so times mean something only where the machine had nothing else to do.
 """
 
 from __future__ import annotations
@@ -15,21 +19,21 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 from scipy.special import erf
 
-from osfcore.control.first_frame import estimate_first
-from osfcore.errors import InvalidInput, MissingAssets, OsfError, check_ranges, check_seed
-from osfcore.estimation.first_frame import FirstFrameConfig
+from osfcore.errors import InvalidInput, OsfError
+from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first
 from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
 from osfcore.estimation.objective import ObjectModels
 from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
+from osfcore.experiments import estimation_tasks as tasks
 from osfcore.experiments.charts import Axis, Chart, Curve, cumulative, write_charts
 from osfcore.experiments.estimation_scores import (
     FrameScore,
@@ -38,34 +42,30 @@ from osfcore.experiments.estimation_scores import (
     flagged_shares,
     flags,
     is_right,
-    median,
     objects_of,
     pose_errors,
-    quantile,
     ratios_of,
     refused_frame,
     score_frame,
     share_right,
 )
-from osfcore.experiments.estimation_scores import is_right as is_right_pose
-from osfcore.experiments.estimation_tasks import (
-    FIRST_SCENE,
-    STEPS,
-    BadCase,
-    BadScore,
-    Frame,
-    bad_case,
-    episode,
-    first_frame,
-    goals,
-    summary,
-)
-from osfcore.experiments.estimation_warmup import WARM_SCENE, last_estimate, warm_models
+from osfcore.experiments.estimation_tasks import STEPS, BadScore, last_estimate, warm_models
 from osfcore.experiments.factors import Factor, factor_named
-from osfcore.experiments.fields import MAX_TASKS
-from osfcore.experiments.harness import Piece, TaskCache, TaskResult, file_sha256, results_of, table_sha256
+from osfcore.experiments.harness import (
+    MAX_TASKS,
+    EvaluationStep,
+    Piece,
+    TaskCache,
+    TaskResult,
+    check_run,
+    chosen_objects,
+    file_sha256,
+    results_of,
+    scene_circumstances,
+)
+from osfcore.experiments.statistics import mean, median, quantile, spread
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera, image_side
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
 from osfcore.geometry.states import MAX_OBJECTS, EstimatedState, Observation, SceneState
 from osfcore.inspection.contact_sheet import Comparison, contact_sheet, put_text
 from osfcore.io.files import write_json
@@ -78,19 +78,16 @@ from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.types import Quality, SceneBatch
 from osfcore.world.tasks import Draw, draw_scene
 
-# The parts of the evaluation of estimators, one task at a time, each kept on disk when it is done.
-#
-# Times are of estimates alone: fields are loaded and unpacked, code is compiled and the ways in which objects can
-# lie are found in a warm-up on a scene that no figure uses, because all that is done once in a program's life. They
-# are kept with the rest, so times mean something only where the machine had nothing else to do.
-
-
 VERSION = 2  # raised by hand when figures may change
+REPORT_FILE = "report.json"
 Part = Literal["first", "track", "goal", "ablations"]
 PARTS: tuple[Part, ...] = ("first", "track", "goal", "ablations")
+ALL_VIEWS = (0, 1, 2, 3)  # the default cameras
 VIEWS: dict[int, tuple[int, ...]] = {1: (0,), 2: (0, 2)}  # cameras that an ablation keeps: two face each other
 _SHOWN_QUALITY = Quality(samples_per_side=2)
 _OVERHEAD = (0.0, 0.0, 1.0)
+_FACTOR = "factor_"  # and its name: a part
+ScoreT = TypeVar("ScoreT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +131,85 @@ class EvaluateEstimate:
         return self.out / "estimate" / f"{self.objects}-objects-seed-{self.seed}"
 
 
+def evaluate_estimate(
+    config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
+) -> Iterator[EvaluationStep[EstimateReport]]:
+    """Measure every part that is asked for, task by task; pictures and report.json go to `config.folder`.
+
+    Args:
+        config: what to measure.
+        fields: of the objects and the table.
+        assets: meshes, for the simulator.
+        executor: does tasks side by side, if given; then their times are those of a busy machine.
+
+    Raises:
+        UnknownName, MissingAssets: if an object lacks a field or a mesh, or no factor is called so.
+        InvalidInput: if a number is out of range.
+        WorkerDied: if a worker process ended.
+        CorruptFile, CannotWrite: as files are.
+    """
+    runner = TaskRunner(config, _checked_names(config, fields, assets), fields, assets)
+    kept: dict[str, list[TaskResult]] = {}
+    jobs = _jobs(config, runner, kept)
+    total, done = sum(count for _, count, _ in jobs.values()), 0
+    for key, (title, count, work) in jobs.items():
+        for results in results_of([work(number) for number in range(count)], executor):
+            kept[key] = [result for result in results if result is not None]
+            if (ready := len(kept[key])) < count:
+                yield EvaluationStep(done + ready, total, f"{title} ({ready + 1} of {count})")
+        done += count
+    report = _report(kept)
+    write_plots(config.folder, report)
+    _write_galleries(config.folder, report, kept)
+    write_json(config.folder / REPORT_FILE, report.to_json())
+    yield EvaluationStep(total, total, "Everything is measured", report)
+
+
+def _checked_names(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+    """Return the objects to draw from, after everything asked for was found possible."""
+    check_run(
+        config.tasks,
+        config.seed,
+        ("number of bad cases", config.bad, 0, MAX_TASKS),
+        ("objects in a scene", config.objects, 1, MAX_OBJECTS),
+        size=config.size,
+    )
+    for part in config.parts:
+        if part not in PARTS:
+            raise InvalidInput("part", part, f"one of {', '.join(PARTS)}")
+    for factor in config.factors:
+        factor_named(factor)  # raises UnknownName
+    names = chosen_objects(config.names, fields, assets)
+    least = config.objects + (1 if config.bad else 0)  # a bad case calls an object by another's name
+    if len(names) < least:
+        raise InvalidInput("number of names", len(names), f"{least} or more for {config.objects} objects in a scene")
+    if config.bad and config.objects < 2:
+        raise InvalidInput("objects in a scene", config.objects, "2 or more with bad cases, which swap masks")
+    return names
+
+
+def _jobs(
+    config: EvaluateEstimate, runner: TaskRunner, kept: Mapping[str, Sequence[TaskResult]]
+) -> dict[str, tuple[str, int, Callable[[int], Piece]]]:
+    """Return title, number and maker of the pieces of each part; tracks and goals begin with first frames in `kept`."""
+    count = config.tasks
+    jobs: dict[str, tuple[str, int, Callable[[int], Piece]]] = {"first": ("First frames", count, runner.first)}
+    if "track" in config.parts:
+        jobs["track"] = "Tracks", count, lambda number: runner.track(number, kept["first"][number])
+    if "goal" in config.parts:
+        jobs["goal"] = "Goals", count, lambda number: runner.goal(number, kept["first"][number])
+    if "ablations" in config.parts:
+        jobs["fixed_light"] = "Light held overhead", count, runner.fixed_light
+        for views, cameras in VIEWS.items():
+            title = f"{views} of {len(ALL_VIEWS)} views"
+            jobs[f"views_{views}"] = title, count, partial(runner.first, cameras=cameras)
+    for factor in config.factors:
+        jobs[f"{_FACTOR}{factor}"] = f"Factor {factor}", count, partial(runner.varied, factor=factor)
+    if config.bad:
+        jobs["bad"] = "Bad cases", config.bad, runner.bad
+    return jobs
+
+
 class TaskRunner:
     """Makes pieces of work; what a piece needs is loaded once in each process that does some.
 
@@ -149,7 +225,7 @@ class TaskRunner:
     ) -> None:
         self._config, self._names, self._fields, self._library = config, names, fields, assets
         self._cameras = default_cameras(config.size)
-        self._assets: dict[str, ObjectAsset] = {}
+        self._load = cache(assets.load)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Be sent to another process, where all pieces share one."""
@@ -157,107 +233,103 @@ class TaskRunner:
 
     # Parts
 
-    def first(self, number: int) -> Piece:
-        """The first frame of a task; its figures hold the score and the estimated state."""
-        return self._first("first", number, self._config.effort, tuple(range(len(self._cameras))))
-
-    def varied(self, number: int, factor: str) -> Piece:
-        """The first frame of a task under a factor of variation."""
-        draw, effort = self._draw(number), self._config.effort
-        given = {**self._circumstances(draw, asdict(effort)), "factor": factor}
-        work = partial(self._seen_first, draw, effort, tuple(range(len(self._cameras))), factor_named(factor))
-        return self._piece(f"factor_{factor}", number, given, work)
+    def first(self, number: int, cameras: tuple[int, ...] = ALL_VIEWS) -> Piece:
+        """Return the first frame of a task, seen by some cameras; its figures hold score and estimated state."""
+        part = "first" if cameras == ALL_VIEWS else f"views_{len(cameras)}"
+        return self._first(part, number, self._config.effort, cameras)
 
     def fixed_light(self, number: int) -> Piece:
-        """The first frame with the light held overhead."""
-        effort = replace(self._config.effort, held_light=_OVERHEAD)
-        return self._first("fixed_light", number, effort, tuple(range(len(self._cameras))))
+        """Return the first frame with the light held overhead."""
+        return self._first("fixed_light", number, replace(self._config.effort, held_light=_OVERHEAD), ALL_VIEWS)
 
-    def few_views(self, number: int, views: int) -> Piece:
-        """The first frame from one or two cameras."""
-        return self._first(f"views_{views}", number, self._config.effort, VIEWS[views])
+    def varied(self, number: int, factor: str) -> Piece:
+        """Return the first frame of a task under a factor of variation."""
+        draw, effort = self._draw(number), self._config.effort
+        work = partial(self._seen_first, draw, effort, ALL_VIEWS, factor_named(factor))
+        return self._piece(f"{_FACTOR}{factor}", number, draw, asdict(effort), work, factor=factor)
 
     def track(self, number: int, first: TaskResult) -> Piece:
-        """Later frames of a task, from its first estimate on."""
+        """Return later frames of a task, from its first estimate on."""
         draw, effort = self._draw(number), self._config.track
-        begun = {"first": digest(first.figures), "steps": self._config.steps}
         score = decode(FrameScore, first.figures["score"], "score")
         work = partial(self._tracked, draw, state_of(first), score, effort)
-        return self._piece("track", number, {**self._circumstances(draw, asdict(effort)), **begun}, work)
+        more = {"first": _digest(first), "steps": self._config.steps}
+        return self._piece("track", number, draw, asdict(effort), work, **more)
 
     def goal(self, number: int, first: TaskResult) -> Piece:
-        """The goals of a task, told how the objects lie by its first estimate."""
+        """Return the goals of a task; how the objects lie is known from its first estimate."""
         draw, effort = self._draw(number), self._config.goal
-        given = {**self._circumstances(draw, asdict(effort)), "first": digest(first.figures)}
-        return self._piece("goal", number, given, partial(self._goals, draw, state_of(first), effort))
+        work = partial(self._goals, draw, state_of(first), effort)
+        return self._piece("goal", number, draw, asdict(effort), work, first=_digest(first))
 
     def bad(self, number: int) -> Piece:
-        """A spoiled input."""
-        config = self._config
-        draw = self._draw(FIRST_SCENE + number)
-        given = self._circumstances(draw, {"first": asdict(config.effort), "goal": asdict(config.goal)})
+        """Return a spoiled input."""
+        draw = self._draw(tasks.FIRST_SCENE + number)
+        effort = {"first": asdict(self._config.effort), "goal": asdict(self._config.goal)}
         # A case may call up an object that its scene does not hold.
-        given["all"] = {name: [self._weights[name], self._library.digest(name)] for name in self._names}
-        return self._piece("bad", number, given, partial(self._spoiled, number, draw.seed))
+        return self._piece("bad", number, draw, effort, partial(self._spoiled, number, draw.seed), all=self._checksums)
 
-    def _first(self, part: str, number: int, effort: FirstFrameConfig, views: tuple[int, ...]) -> Piece:
+    def _first(self, part: str, number: int, effort: FirstFrameConfig, cameras: tuple[int, ...]) -> Piece:
         draw = self._draw(number)
-        given = {**self._circumstances(draw, asdict(effort)), "views": list(views)}
-        return self._piece(part, number, given, partial(self._seen_first, draw, effort, views))
+        work = partial(self._seen_first, draw, effort, cameras)
+        return self._piece(part, number, draw, asdict(effort), work, views=list(cameras))
 
-    def _piece(self, part: str, number: int, given: dict[str, Any], work: Callable[[], TaskResult]) -> Piece:
+    def _piece(
+        self, part: str, number: int, draw: Draw, effort: dict[str, Any], work: Callable[[], TaskResult], **more: object
+    ) -> Piece:
+        given = {
+            "version": VERSION,
+            **scene_circumstances(draw, self._fields, self._library),
+            "size": self._config.size,
+            "effort": effort,
+            **more,
+        }
         return Piece(f"{number:04d}", TaskCache(self._config.folder / part), given, work)
 
     # How they are measured
 
     def _seen_first(
-        self, draw: Draw, effort: FirstFrameConfig, views: tuple[int, ...], factor: Factor | None = None
+        self, draw: Draw, effort: FirstFrameConfig, cameras: tuple[int, ...], factor: Factor | None = None
     ) -> TaskResult:
-        frame = first_frame(draw, self._library, tuple(self._cameras[view] for view in views), factor)
+        frame = tasks.first_frame(draw, self._library, tuple(self._cameras[n] for n in cameras), factor)
         rng = stream_rng(draw.seed, Stream.FIRST_FRAME)
         score, estimate = self._timed(estimate_first(self._models, frame.observation, rng, effort), frame)
         figures = {"score": encode(score), "state": None if estimate is None else estimated_to_json(estimate)}
-        return TaskResult(figures, self._compared(frame.observation, None if estimate is None else estimate.state))
+        return TaskResult(figures, self._compared(frame.observation, estimate))
 
     def _tracked(self, draw: Draw, start: SceneState | None, first: FrameScore, effort: TrackingConfig) -> TaskResult:
-        pushes = episode(draw, self._library, self._cameras, steps=self._config.steps)
+        pushes = tasks.episode(draw, self._library, self._cameras, steps=self._config.steps)
         if start is None:
-            score = TrackScore(
-                draw.names, (False,) * len(draw.names), (), (), (), (), (), pushes.moved_m, first.refused
-            )
+            nothing = (False,) * len(draw.names)
+            score = TrackScore(draw.names, nothing, (), (), (), (), (), pushes.moved_m, first.refused)
             return TaskResult({"score": encode(score)}, self._compared(pushes.frames[-1].observation, None))
         models, assets, expected = self._models, self._meshes(draw.names), start
         rng = stream_rng(draw.seed, Stream.TRACKING)
-        rows: dict[str, Any] = {key: [] for key in ("position_mm", "rotation_deg", "doubted", "seconds")}
-        states = []
+        estimates, errors, seconds = [], [], []
         for frame in pushes.frames:
             began = time.perf_counter()
-            estimate = last_estimate(estimate_next(models, frame.observation, expected, rng, effort))
-            rows["seconds"].append(time.perf_counter() - began)
-            expected = estimate.state
-            position, rotation = pose_errors(expected, frame.truth, assets)
-            rows["position_mm"].append(tuple(position.tolist()))
-            rows["rotation_deg"].append(tuple(rotation.tolist()))
-            rows["doubted"].append(flags(estimate))
-            states.append(expected)
+            estimates.append(last_estimate(estimate_next(models, frame.observation, expected, rng, effort)))
+            seconds.append(time.perf_counter() - began)
+            expected = estimates[-1].state
+            errors.append(pose_errors(expected, frame.truth, assets))
         score = TrackScore(
-            draw.names,
-            tuple(one.is_right for one in first.objects),
-            tuple(rows["position_mm"]),
-            tuple(rows["rotation_deg"]),
-            tuple(frame.absent for frame in pushes.frames),
-            tuple(rows["doubted"]),
-            tuple(rows["seconds"]),
-            pushes.moved_m,
+            names=draw.names,
+            right_at_start=tuple(one.is_right for one in first.objects),
+            position_mm=tuple(tuple(position.tolist()) for position, _ in errors),
+            rotation_deg=tuple(tuple(rotation.tolist()) for _, rotation in errors),
+            absent=tuple(frame.absent for frame in pushes.frames),
+            doubted=tuple(map(flags, estimates)),
+            seconds=tuple(seconds),
+            moved_m=pushes.moved_m,
         )
         lost = [step for step in score.lost_at if step is not None]
-        step = min(lost, default=len(states) - 1)  # where it went wrong, or how it ended
-        shown = self._compared(pushes.frames[step].observation, states[step])
+        step = min(lost, default=len(estimates) - 1)  # where it went wrong, or how it ended
+        shown = self._compared(pushes.frames[step].observation, estimates[step])
         return TaskResult({"score": encode(score), "shown_step": step, "redrawn": pushes.redrawn}, shown)
 
     def _goals(self, draw: Draw, prior: SceneState | None, effort: GoalImageConfig) -> TaskResult:
         scores, shown, moved, models = [], [], [], self._models
-        for goal in goals(draw, self._library, goal_camera(self._config.size)):
+        for goal in tasks.goals(draw, self._library, goal_camera(self._config.size)):
             frame, estimate = goal.frame, None
             if prior is None:
                 score = refused_frame(draw.names, "The first frame was refused.", 0.0)
@@ -265,41 +337,40 @@ class TaskRunner:
                 score, estimate = self._timed(estimate_goal(models, frame.observation, prior, effort), frame)
             scores.append(encode(score))
             moved.append(list(goal.moved))
-            shown += self._compared(frame.observation, None if estimate is None else estimate.state)
+            shown += self._compared(frame.observation, estimate)
         return TaskResult({"scores": scores, "moved": moved}, tuple(shown))
 
     def _spoiled(self, number: int, seed: int) -> TaskResult:
         models, config, rng = self._models, self._config, stream_rng(seed, Stream.FIRST_FRAME)
-        case = bad_case(self._names, config.objects, config.seed, number, self._library, config.size)
+        case = tasks.bad_case(self._names, config.objects, config.seed, number, self._library, config.size)
         began, estimate, refused = time.perf_counter(), None, ""
         try:
-            if case.start is None:
-                estimate = last_estimate(estimate_first(models, case.observation, rng, config.effort))
-            else:
-                prior = last_estimate(estimate_first(models, case.start, rng, config.effort)).state
+            steps = estimate_first(models, case.observation if case.start is None else case.start, rng, config.effort)
+            if case.start is not None:
+                prior = last_estimate(steps).state
                 began = time.perf_counter()
-                estimate = last_estimate(estimate_goal(models, case.observation, prior, config.goal))
+                steps = estimate_goal(models, case.observation, prior, config.goal)
+            estimate = last_estimate(steps)
         except OsfError as error:
             refused = str(error)
         seconds = time.perf_counter() - began
-        shown = self._compared(case.observation, None if estimate is None else estimate.state)
-        score = BadScore(case.kind, refused, "", is_right=False, seconds=seconds)
-        if estimate is not None:
-            score = replace(self._judged(estimate, case), seconds=seconds)
-        return TaskResult({"score": encode(score)}, shown)
+        score = (
+            BadScore(case.kind, refused, "", is_right=False, seconds=seconds)
+            if estimate is None
+            else self._judged(estimate, case, seconds)
+        )
+        return TaskResult({"score": encode(score)}, self._compared(case.observation, estimate))
 
-    def _judged(self, estimate: EstimatedState, case: BadCase) -> BadScore:
-        """Errors of objects that are there; an answer that names one that is not there is wrong."""
+    def _judged(self, estimate: EstimatedState, case: tasks.BadCase, seconds: float) -> BadScore:
+        """Score the objects that are there; an answer that names one that is not there is wrong."""
         there = [n for n, name in enumerate(estimate.state.names) if name in case.truth.names]
         names = tuple(estimate.state.names[n] for n in there)
         state = replace(estimate.state, names=names, poses=estimate.state.poses[there])
-        position, rotation = pose_errors(state, case.truth, self._meshes(names))
-        is_right = len(names) == len(estimate.state.names) and all(map(is_right_pose, position, rotation))
-        return BadScore(
-            case.kind, "", estimate.reason, is_right, tuple(position.tolist()), tuple(rotation.tolist())
-        )  # fmt: skip
+        position, rotation = (errors.tolist() for errors in pose_errors(state, case.truth, self._meshes(names)))
+        are_right = len(names) == len(estimate.state.names) and all(map(is_right, position, rotation))
+        return BadScore(case.kind, "", estimate.reason, are_right, tuple(position), tuple(rotation), seconds)
 
-    def _timed(self, steps: Iterator[EstimateStep], frame: Frame) -> tuple[FrameScore, EstimatedState | None]:
+    def _timed(self, steps: Iterator[EstimateStep], frame: tasks.Frame) -> tuple[FrameScore, EstimatedState | None]:
         """Run an estimate; a refusal is a result too."""
         began = time.perf_counter()
         try:
@@ -307,79 +378,57 @@ class TaskRunner:
         except OsfError as error:
             return refused_frame(frame.truth.names, str(error), time.perf_counter() - began), None
         seconds = time.perf_counter() - began
-        meshes = self._meshes(frame.truth.names)
-        return score_frame(estimate, frame.truth, meshes, seconds, frame.absent), estimate
+        return score_frame(estimate, frame.truth, self._meshes(frame.truth.names), seconds, frame.absent), estimate
 
-    def _compared(self, observation: Observation, state: SceneState | None) -> tuple[Comparison, ...]:
-        """Each view, observed and rendered from the estimate; black where there is none."""
+    def _compared(self, observation: Observation, estimate: EstimatedState | None) -> tuple[Comparison, ...]:
+        """Return each view, observed and rendered from the estimate; black where there is none."""
         ours = np.zeros_like(observation.images)
-        if state is not None:
-            batch = SceneBatch.of(state)
+        if estimate is not None:
+            batch = SceneBatch.of(estimate.state)
             ours = self._models.together.render(batch, observation.cameras, quality=_SHOWN_QUALITY).rgb[0]
         rows = zip(observation.cameras, observation.images, ours, strict=True)
         return tuple(Comparison(f"camera {camera.name}", to_uint8(a), to_uint8(b)) for camera, a, b in rows)
-
-    # What they depend on
 
     @cached_property
     def _models(self) -> ObjectModels:
         """Loaded when the first estimate is asked for: all may be known from earlier runs."""
         config = self._config
         goal = "goal" in config.parts or config.bad > 0
-        draw = self._draw(WARM_SCENE)
+        draw = self._draw(tasks.WARM_SCENE)
         return warm_models(self._names, self._fields, self._library, draw, config.size, goal=goal)
 
     @cached_property
-    def _weights(self) -> dict[str, str]:
-        return {name: file_sha256(self._fields.info(name).path) for name in self._names}
-
-    @cached_property
-    def _table(self) -> str:
-        return table_sha256(self._fields.load_table())
-
-    def _circumstances(self, draw: Draw, effort: dict[str, Any]) -> dict[str, Any]:
-        """Everything that a result depends on."""
-        return {
-            "version": VERSION,
-            "weights": {name: self._weights[name] for name in draw.names},
-            "assets": {name: self._library.digest(name) for name in draw.names},
-            "table": self._table,
-            "arrangement": draw.seed,
-            "light": draw.light.direction.tolist(),
-            "size": self._config.size,
-            "effort": effort,
-        }
+    def _checksums(self) -> dict[str, list[str]]:
+        """Checksums of all objects' fields and meshes."""
+        return {name: [file_sha256(self._fields.info(name).path), self._library.digest(name)] for name in self._names}
 
     def _draw(self, number: int) -> Draw:
         return draw_scene(self._names, self._config.objects, self._config.seed, number)
 
-    def _meshes(self, names: Sequence[str]) -> dict[str, ObjectAsset]:
-        for name in names:
-            if name not in self._assets:
-                self._assets[name] = self._library.load(name)
-        return {name: self._assets[name] for name in names}
+    def _meshes(self, names: Iterable[str]) -> dict[str, ObjectAsset]:
+        return {name: self._load(name) for name in names}
 
 
 def state_of(first: TaskResult) -> SceneState | None:
-    """What was estimated of a first frame, as it was kept."""
+    """Return the estimated state of a first frame, as it was kept; None if the frame was refused."""
     state = first.figures["state"]
     return None if state is None else estimated_from_json(state).state
 
 
-def digest(figures: dict[str, Any]) -> str:
-    """Of a first estimate, which others begin with."""
-    return hashlib.sha256(json.dumps(figures["state"], sort_keys=True).encode()).hexdigest()
+def _digest(first: TaskResult) -> str:
+    """Return the checksum of a first estimate, which others begin with."""
+    return hashlib.sha256(json.dumps(first.figures["state"], sort_keys=True).encode()).hexdigest()
 
 
 @lru_cache(maxsize=1)
 def _shared_runner(
     config: EvaluateEstimate, names: tuple[str, ...], fields: FieldLibrary, assets: AssetLibrary
 ) -> TaskRunner:
-    """The runner of a worker process."""
+    """Return the one runner of a worker process."""
     return TaskRunner(config, names, fields, assets)
 
 
-# What the parts of the evaluation of estimators amount to.
+# The report.
 
 
 DRIFT_STEPS = (5, 10, 15, 20)
@@ -416,65 +465,70 @@ class EstimateReport:
         return tuple(goal for task in self.goals or () for goal in task)
 
     def by_views(self) -> dict[int, tuple[FrameScore, ...]]:
-        """First frames by number of cameras, the main ones among them."""
-        cameras = 4  # the default ones
-        return {**(self.views or {}), cameras: self.first}
+        """Return first frames by number of cameras, those from all cameras among them."""
+        return {**(self.views or {}), len(ALL_VIEWS): self.first}
 
     def to_json(self) -> dict[str, Any]:
-        """The report as plain numbers: millimetres, degrees, seconds, shares in [0, 1]; null for what was not measured.
+        """Return plain numbers: millimetres, degrees, seconds, shares in [0, 1]; null for what was not measured.
 
         `flagged_good` and `flagged_bad` are over first frames and goals together.
         """
         flagged_good, flagged_bad = flagged_shares([*self.first, *self.all_goals])
-        return {
+        report = {
             "tasks": len(self.first),
             **_frames(self.first, "first"),
             "by_object": _by_object(self.first),
             **_uncertainty(self.first),
-            **_goals(self.goals),
+            **_goals(self),
             "flagged_good": flagged_good,
             "flagged_bad": flagged_bad,
             **_tracks(self.tracks),
             "frac_1cm_5deg_fixed_light": None if self.fixed_light is None else share_right(self.fixed_light),
             "fixed_light": None if self.fixed_light is None else _brief(self.fixed_light),
             "by_views": None if self.views is None else {str(n): _brief(f) for n, f in self.by_views().items()},
-            **(summary(self.bad) if self.bad is not None else {}),
-            **(
-                {"by_factor": {name: _varied_figures(frames) for name, frames in self.factors.items()}}
-                if self.factors
-                else {}
-            ),
         }
+        if self.bad is not None:
+            report |= tasks.summary(self.bad)
+        if self.factors:
+            report["by_factor"] = {name: _varied_figures(frames) for name, frames in self.factors.items()}
+        return report
+
+
+def _report(kept: Mapping[str, Sequence[TaskResult]]) -> EstimateReport:
+    def scores(kind: type[ScoreT], key: str) -> tuple[ScoreT, ...]:
+        return tuple(decode(kind, result.figures["score"], "score") for result in kept[key])
+
+    def goals(result: TaskResult) -> tuple[FrameScore, ...]:
+        return tuple(decode(FrameScore, score, "score") for score in result.figures["scores"])
+
+    return EstimateReport(
+        first=scores(FrameScore, "first"),
+        tracks=scores(TrackScore, "track") if "track" in kept else None,
+        goals=tuple(map(goals, kept["goal"])) if "goal" in kept else None,
+        fixed_light=scores(FrameScore, "fixed_light") if "fixed_light" in kept else None,
+        views={n: scores(FrameScore, f"views_{n}") for n in VIEWS} if "fixed_light" in kept else None,
+        bad=scores(BadScore, "bad") if "bad" in kept else None,
+        factors={key.removeprefix(_FACTOR): scores(FrameScore, key) for key in kept if key.startswith(_FACTOR)},
+    )
 
 
 def _frames(frames: Sequence[FrameScore], what: str) -> dict[str, Any]:
     objects = objects_of(frames)
-    position, rotation = [o.position_mm for o in objects], [o.rotation_deg for o in objects]
     return {
         "objects_total": sum(len(frame.names) for frame in frames),
         "frac_1cm_5deg": share_right(frames),
-        **_spread("position_mm", position),
-        **_spread("rotation_deg", rotation),
-        **_spread("adds_mm", [o.adds_mm for o in objects]),
-        **_spread("light_deg", [frame.light_deg for frame in frames if frame.light_deg is not None]),
-        **_spread(f"{what}_s", [frame.seconds for frame in frames]),
+        **spread("position_mm", [o.position_mm for o in objects], _OF),
+        **spread("rotation_deg", [o.rotation_deg for o in objects], _OF),
+        **spread("adds_mm", [o.adds_mm for o in objects], _OF),
+        **spread("light_deg", [frame.light_deg for frame in frames if frame.light_deg is not None], _OF),
+        **spread(f"{what}_s", [frame.seconds for frame in frames], _OF),
         f"{what}_refused": sum(bool(frame.refused) for frame in frames),
         f"{what}_out_of_view": sum(bool(o.absent) for o in objects),
     }
 
 
-def _spread(what: str, values: Sequence[float]) -> dict[str, float | None]:
-    """Median, mean and tails."""
-    return {
-        f"{what}_median": median(values),
-        f"{what}_mean": float(np.mean(values)) if len(values) else None,
-        f"{what}_p90": quantile(values, 0.9),
-        f"{what}_p95": quantile(values, 0.95),
-    }
-
-
 def _by_object(frames: Sequence[FrameScore]) -> dict[str, dict[str, Any]]:
-    """Of each object: how often it was seen, how often it was right, and its errors."""
+    """Return for each object how often it was seen, how often it was right, and its errors."""
     rows: dict[str, dict[str, Any]] = {}
     for name in sorted({name for frame in frames for name in frame.names}):
         own = [o for o in objects_of(frames) if o.name == name]
@@ -482,81 +536,80 @@ def _by_object(frames: Sequence[FrameScore]) -> dict[str, dict[str, Any]]:
         rows[name] = {
             "frames": shown,
             "frac_1cm_5deg": sum(o.is_right for o in own) / shown,
-            **_spread("position_mm", [o.position_mm for o in own]),
-            **_spread("rotation_deg", [o.rotation_deg for o in own]),
+            **spread("position_mm", [o.position_mm for o in own], _OF),
+            **spread("rotation_deg", [o.rotation_deg for o in own], _OF),
         }
     return rows
 
 
 def _uncertainty(frames: Sequence[FrameScore]) -> dict[str, Any]:
-    """How honest claimed deviations are, and how large; of right estimates alone."""
+    """Return how honest claimed deviations are, and how large; of right estimates alone."""
     ratios = ratios_of(frames)
-    claimed = [o.position_std_mm for o in objects_of(frames) if o.is_right and o.position_std_mm is not None]
     return {
         "two_sigma_coverage": coverage(ratios.pooled),
         "two_sigma_coverage_position": coverage(ratios.position),
         "two_sigma_coverage_rotation": coverage(ratios.rotation),
         "two_sigma_coverage_light": coverage(ratios.light),
-        "mean_position_std_mm": float(np.mean(claimed)) if claimed else None,
+        "mean_position_std_mm": mean(o.position_std_mm for o in objects_of(frames) if o.is_right),
     }
 
 
-def _goals(goals: Sequence[Sequence[FrameScore]] | None) -> dict[str, Any]:
-    flat = [goal for task in goals or () for goal in task]
-    row = _frames(flat, "goal")
-    by_moved: dict[str, float | None] = {}
-    for moved in range(max((len(task) for task in goals or ()), default=0)):
-        by_moved[str(moved + 1)] = share_right([task[moved] for task in goals or () if len(task) > moved])
+def _goals(report: EstimateReport) -> dict[str, Any]:
+    goals = report.goals or ()
+    row = _frames(report.all_goals, "goal")
     errors = [f"{what}_{of}" for what in ("position_mm", "rotation_deg", "light_deg") for of in _OF]
-    keys = ("frac_1cm_5deg", "objects_total", *errors)
-    own = (*(f"goal_s_{of}" for of in _OF), "goal_refused", "goal_out_of_view")
-    if goals is None:
-        return {**dict.fromkeys([f"goal_{key}" for key in keys] + list(own)), "goal_frac_1cm_5deg_by_moved": None}
-    return {
-        **{f"goal_{key}": row[key] for key in keys},
-        **{key: row[key] for key in own},
-        "goal_frac_1cm_5deg_by_moved": by_moved,
+    most = max(map(len, goals), default=0)
+    figures = {
+        **{f"goal_{key}": row[key] for key in ("frac_1cm_5deg", "objects_total", *errors)},
+        **{key: value for key, value in row.items() if key.startswith("goal_")},
+        "goal_frac_1cm_5deg_by_moved": {
+            str(n + 1): share_right([task[n] for task in goals if len(task) > n]) for n in range(most)
+        },
     }
+    return dict.fromkeys(figures) if report.goals is None else figures
 
 
-def _tracks(tracks: Sequence[TrackScore] | None) -> dict[str, Any]:
-    """How tracking went.
+def _tracks(measured: Sequence[TrackScore] | None) -> dict[str, Any]:
+    """Return figures of tracking.
 
     An episode is lost when one of its objects is; `track_lost_from_wrong_start` counts those among them whose lost
     objects were all wrong in the first frame already. Steps at which an object lay beside the table or hidden from all
     cameras are left out of drift and losses and counted here, as pairs of object and step.
     """
-    keys = (
-        "refine_hz", *(f"refine_s_{of}" for of in _OF), "track_episodes", "track_lost", "track_lost_from_wrong_start",
-        "track_objects_lost", "track_frac_1cm_5deg", "track_off_table", "track_out_of_view", "drift_mm", "drift_deg",
-        "track_moved", "track_resting",
-    )  # fmt: skip
-    if tracks is None:
-        return dict.fromkeys(keys)
+    tracks = measured or ()
     seconds = [second for track in tracks for second in track.seconds]
     typical = median(seconds)
     lost = [[n for n, step in enumerate(track.lost_at) if step is not None] for track in tracks]
-    pairs = list(zip(tracks, lost, strict=True))
-    excused = [bool(gone) and not any(track.right_at_start[n] for n in gone) for track, gone in pairs]
+    from_wrong = [
+        bool(gone) and not any(track.right_at_start[n] for n in gone) for track, gone in zip(tracks, lost, strict=True)
+    ]
     absent = [why for track in tracks for row in track.absent for why in row]
-    right = [is_right(p, r) for track in tracks for step in range(len(track.seconds)) for p, r in _seen(track, step)]
-    values = (
-        1 / typical if typical else None, *_spread("", seconds).values(), len(tracks), sum(map(bool, lost)),
-        sum(excused), sum(map(len, lost)), sum(right) / len(right) if right else None,
-        absent.count("off the table"), absent.count("out of view"), drift(tracks, 0), drift(tracks, 1),
-        _apart(tracks, has_moved=True), _apart(tracks, has_moved=False),
-    )  # fmt: skip
-    return dict(zip(keys, values, strict=True))
+    steps = [pair for track in tracks for step in range(len(track.seconds)) for pair in _seen(track, step)]
+    figures = {
+        "refine_hz": 1 / typical if typical else None,
+        **spread("refine_s", seconds, _OF),
+        "track_episodes": len(tracks),
+        "track_lost": sum(map(bool, lost)),
+        "track_lost_from_wrong_start": sum(from_wrong),
+        "track_objects_lost": sum(map(len, lost)),
+        "track_frac_1cm_5deg": mean(is_right(position, rotation) for position, rotation in steps),
+        "track_off_table": absent.count("off the table"),
+        "track_out_of_view": absent.count("out of view"),
+        "drift_mm": drift(tracks, 0),
+        "drift_deg": drift(tracks, 1),
+        "track_moved": _apart(tracks, has_moved=True),
+        "track_resting": _apart(tracks, has_moved=False),
+    }
+    return dict.fromkeys(figures) if measured is None else figures
 
 
-def drift(tracks: Iterable[TrackScore], which: int) -> dict[str, float | None]:
-    """Median error of position [mm] (0) or rotation [deg] (1) over all visible objects, by step."""
-    known = list(tracks)
-    return {str(step): median(errors_at(known, step, which)) for step in DRIFT_STEPS}
+def drift(tracks: Sequence[TrackScore], which: int) -> dict[str, float | None]:
+    """Return the median error of position [mm] (0) or rotation [deg] (1) over all visible objects, by step."""
+    return {str(step): median(errors_at(tracks, step, which)) for step in DRIFT_STEPS}
 
 
 def errors_at(tracks: Iterable[TrackScore], step: int, which: int) -> list[float]:
-    """Errors of all visible objects at one step.
+    """Return the errors of all visible objects at one step.
 
     Args:
         tracks: those that ended before this step have none.
@@ -567,7 +620,7 @@ def errors_at(tracks: Iterable[TrackScore], step: int, which: int) -> list[float
 
 
 def _apart(tracks: Sequence[TrackScore], *, has_moved: bool) -> dict[str, float | None]:
-    """Errors over all steps of the objects that were pushed at least 1 cm away in their episode, or of all others."""
+    """Return errors over all steps of objects that were pushed 1 cm or more in their episode, or of all others."""
     rows = [
         (track.position_mm[step][n], track.rotation_deg[step][n])
         for track in tracks
@@ -577,11 +630,11 @@ def _apart(tracks: Sequence[TrackScore], *, has_moved: bool) -> dict[str, float 
         if not track.absent[step][n]
     ]
     position, rotation = ([row[k] for row in rows] for k in (0, 1))
-    return {**_spread("position_mm", position), **_spread("rotation_deg", rotation)}
+    return {**spread("position_mm", position, _OF), **spread("rotation_deg", rotation, _OF)}
 
 
 def _seen(track: TrackScore, step: int) -> list[tuple[float, float]]:
-    """Errors at a step of the objects that some image shows."""
+    """Return the errors at a step of the objects that some image shows."""
     rows = zip(track.position_mm[step], track.rotation_deg[step], track.absent[step], strict=True)
     return [(position, rotation) for position, rotation, why in rows if not why]
 
@@ -609,15 +662,95 @@ def _varied_figures(frames: Sequence[FrameScore]) -> dict[str, Any]:
     }
 
 
-# Pictures of an evaluation of estimators: curves of errors, and galleries of what went wrong.
+# Curves of errors.
+
+
+_SHARE = Axis("share of objects", 0, 1)
+_POSITION, _ROTATION = Axis("position error [mm]", 0, 20), Axis("rotation error [deg]", 0, 10)
+
+
+def write_plots(folder: Path, report: EstimateReport) -> None:
+    """Draw errors.png and calibration.png, and track.png and views.png where these parts were measured.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    write_charts(folder / "errors.png", _errors_charts(report))
+    write_charts(folder / "calibration.png", [_calibration_chart(report.first)])
+    if report.tracks:
+        write_charts(folder / "track.png", _track_charts(report.tracks))
+    if report.views is not None:
+        write_charts(folder / "views.png", _views_charts(report))
+
+
+def _errors_charts(report: EstimateReport) -> list[Chart]:
+    """Draw cumulative errors of position and rotation; refused objects keep a curve below 1."""
+    kinds = {
+        "first frame, 4 views": report.first,
+        "goal, 1 view": report.all_goals,
+        "light held overhead": report.fixed_light,
+    }
+    panels = []
+    for axis, key in ((_POSITION, "position_mm"), (_ROTATION, "rotation_deg")):
+        curves = [
+            cumulative(name, [getattr(o, key) for o in objects_of(frames)], axis, sum(len(f.names) for f in frames))
+            for name, frames in kinds.items()
+            if frames
+        ]
+        panels.append(Chart("Objects with at most this error", axis, _SHARE, curves))
+    return panels
+
+
+def _calibration_chart(frames: Sequence[FrameScore]) -> Chart:
+    """Draw how often errors lie within so many claimed deviations, against Gaussian errors."""
+    axis, ratios = Axis("|error| / claimed deviation", 0, 5), ratios_of(frames)
+    x = np.linspace(0, 5, 200)
+    curves = [
+        Curve("if it were Gaussian", x, erf(x / np.sqrt(2))),
+        *(cumulative(key, getattr(ratios, key), axis) for key in ("position", "rotation", "light")),
+    ]
+    return Chart("Right estimates: are deviations honest?", axis, Axis("share of components", 0, 1), curves)
+
+
+def _dots(name: str, x: np.ndarray, values: Iterable[float | None]) -> Curve:
+    return Curve(name, x, np.array(list(values), float), dots=True)
+
+
+def _track_charts(tracks: Sequence[TrackScore]) -> list[Chart]:
+    """Draw errors along episodes: median, and what nine of ten stay below."""
+    count = max(len(track.seconds) for track in tracks)
+    x = np.arange(1.0, count + 1)
+    panels = []
+    for which, axis in enumerate((_POSITION, _ROTATION)):
+        values = [errors_at(tracks, step, which) for step in range(1, count + 1)]
+        curves = [_dots("median", x, map(median, values)), _dots("90 % below", x, (quantile(v, 0.9) for v in values))]
+        panels.append(Chart("Without masks, step by step", Axis("step", 0, max(count, 1)), Axis(axis.label, 0), curves))
+    return panels
+
+
+def _views_charts(report: EstimateReport) -> list[Chart]:
+    """Draw accuracy by number of cameras."""
+    views = dict(sorted(report.by_views().items()))
+    x, frames = np.array(list(views), float), list(views.values())
+    axis = Axis("cameras", 0, float(x.max()) + 1)
+    errors = [
+        _dots(name, x, (median(getattr(o, key) for o in objects_of(f)) for f in frames))
+        for name, key in (("position, median [mm]", "position_mm"), ("rotation, median [deg]", "rotation_deg"))
+    ]
+    errors.append(_dots("light, median [deg]", x, (median(frame.light_deg for frame in f) for f in frames)))
+    return [
+        Chart("Under 1 cm and 5 deg", axis, _SHARE, [_dots("share", x, map(share_right, frames))]),
+        Chart("Errors", axis, Axis("error", 0), errors),
+    ]
+
+
+# Galleries of failures.
 
 
 MOST_SHOWN = 20  # tasks in a gallery
 _PER_ROW = 4
 _LINE_PX = 16
 _LEAST_WIDTH_PX = 680
-_SHARE = Axis("share of objects", 0, 1)
-_POSITION, _ROTATION = Axis("position error [mm]", 0, 20), Axis("rotation error [deg]", 0, 10)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -635,86 +768,8 @@ class Failure:
     shown: tuple[Comparison, ...]
 
 
-def write_plots(folder: Path, report: EstimateReport) -> None:
-    """Draw errors.png and calibration.png, and track.png and views.png where these parts were measured.
-
-    Raises:
-        CannotWrite: if the disk refuses.
-    """
-    write_charts(folder / "errors.png", errors_charts(report))
-    write_charts(folder / "calibration.png", calibration_charts(report.first))
-    if report.tracks:
-        write_charts(folder / "track.png", track_charts(report.tracks))
-    if report.views is not None:
-        write_charts(folder / "views.png", views_charts(report))
-
-
-def errors_charts(report: EstimateReport) -> list[Chart]:
-    """Cumulative errors of position and rotation; refused objects keep a curve below 1."""
-    kinds = {"first frame, 4 views": report.first, "goal, 1 view": report.all_goals}
-    kinds["light held overhead"] = report.fixed_light or ()
-    panels = []
-    for axis, key in ((_POSITION, "position_mm"), (_ROTATION, "rotation_deg")):
-        curves = []
-        for name, frames in kinds.items():
-            if frames:
-                values = [getattr(score, key) for score in objects_of(frames)]
-                curves.append(cumulative(name, values, axis, sum(len(frame.names) for frame in frames)))
-        panels.append(Chart("Objects with at most this error", axis, _SHARE, curves))
-    return panels
-
-
-def calibration_charts(frames: Sequence[FrameScore]) -> list[Chart]:
-    """How often errors lie within so many claimed deviations, against Gaussian errors."""
-    axis, ratios = Axis("|error| / claimed deviation", 0, 5), ratios_of(frames)
-    x = np.linspace(0, 5, 200)
-    curves = [
-        Curve("if it were Gaussian", x, erf(x / np.sqrt(2))),
-        *(cumulative(key, getattr(ratios, key), axis) for key in ("position", "rotation", "light")),
-    ]
-    return [Chart("Right estimates: are deviations honest?", axis, Axis("share of components", 0, 1), curves)]
-
-
-def track_charts(tracks: Sequence[TrackScore]) -> list[Chart]:
-    """Errors along episodes: median, and what nine of ten stay below."""
-    count = max((len(track.seconds) for track in tracks), default=0)
-    steps = np.arange(1, count + 1)
-    panels = []
-    for which, axis in enumerate((_POSITION, _ROTATION)):
-        values = [errors_at(tracks, int(step), which) for step in steps]
-        curves = [
-            Curve("median", steps.astype(float), np.array([median(v) for v in values], float), dots=True),
-            Curve("90 % below", steps.astype(float), np.array([quantile(v, 0.9) for v in values], float), dots=True),
-        ]
-        errors = Axis(axis.label, 0)
-        panels.append(Chart("Without masks, step by step", Axis("step", 0, max(count, 1)), errors, curves))
-    return panels
-
-
-def views_charts(report: EstimateReport) -> list[Chart]:
-    """Accuracy by number of cameras."""
-    views = report.by_views()
-    x = np.array(sorted(views), float)
-    axis = Axis("cameras", 0, float(x.max()) + 1)
-    frames = [views[int(n)] for n in x]
-    right = np.array([share_right(f) for f in frames], float)
-    errors = [
-        Curve(name, x, np.array([median(getattr(o, key) for o in objects_of(f)) for f in frames], float), dots=True)
-        for name, key in (("position, median [mm]", "position_mm"), ("rotation, median [deg]", "rotation_deg"))
-    ]
-    light = np.array([median(frame.light_deg for frame in f) for f in frames], float)
-    errors.append(Curve("light, median [deg]", x, light, dots=True))
-    return [
-        Chart("Under 1 cm and 5 deg", axis, _SHARE, [Curve("share", x, right, dots=True)]),
-        Chart("Errors", axis, Axis("error", 0), errors),
-    ]
-
-
-# Galleries
-
-
 def frame_failure(title: str, score: FrameScore, shown: Sequence[Comparison]) -> Failure | None:
-    """A frame that was refused, or with an object that is wrong, or right and flagged; None if there is nothing to see.
+    """Describe a frame that was refused, or with an object that is wrong, or right and flagged; None otherwise.
 
     Args:
         title: of the task, for the first line.
@@ -731,13 +786,12 @@ def frame_failure(title: str, score: FrameScore, shown: Sequence[Comparison]) ->
         warning = f"flagged: {o.doubt or 'the whole'}" if o.flagged else "unflagged"
         hidden = f", {o.absent}" if o.absent else ""
         lines.append(f"  {o.name}: {o.position_mm:.1f} mm, {o.rotation_deg:.1f} deg {verdict}{hidden}, {warning}")
-    wrong = [o for o in score.objects if not o.is_right]
-    badness = len(wrong) + sum(not o.flagged for o in wrong) * 10
+    badness = sum(1 if o.flagged else 11 for o in score.objects if not o.is_right)
     return Failure(float(badness), tuple(lines), tuple(shown))
 
 
 def track_failure(title: str, score: TrackScore, shown: Sequence[Comparison]) -> Failure | None:
-    """An episode in which an object was lost, or that had no start; None if there is nothing to see.
+    """Describe an episode in which an object was lost, or that had no start; None otherwise.
 
     Args:
         title: of the task, for the first line.
@@ -759,7 +813,7 @@ def track_failure(title: str, score: TrackScore, shown: Sequence[Comparison]) ->
 
 
 def bad_failure(title: str, score: BadScore, shown: Sequence[Comparison]) -> Failure | None:
-    """A spoiled input that was believed although the answer is wrong; None otherwise.
+    """Describe a spoiled input that was believed although the answer is wrong; None otherwise.
 
     Args:
         title: of the case, for the only line.
@@ -772,21 +826,21 @@ def bad_failure(title: str, score: BadScore, shown: Sequence[Comparison]) -> Fai
     return Failure(1.0, (f"{title}: {score.kind}: wrong without a warning ({errors})",), tuple(shown))
 
 
-def write_gallery(path: Path, failures: Sequence[Failure | None]) -> None:
-    """The worst of them below each other, or no file (an older one goes) where nothing failed.
+def write_gallery(path: Path, failures: Iterable[Failure | None]) -> None:
+    """Draw the worst failures below each other; without any, remove an older picture.
 
     Raises:
         CannotWrite: if the disk refuses.
     """
     chosen = sorted((f for f in failures if f is not None and f.shown), key=lambda f: -f.badness)[:MOST_SHOWN]
     if chosen:
-        write_png(path, gallery(chosen))
+        write_png(path, _gallery(chosen))
     else:
         path.unlink(missing_ok=True)
 
 
-def gallery(failures: Sequence[Failure]) -> UInt8[np.ndarray, "H W 3"]:
-    """For each: what went wrong in words, and below it observed images, rendered ones and their difference."""
+def _gallery(failures: Sequence[Failure]) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw for each what went wrong in words, and below it observed images, rendered ones and their difference."""
     blocks = []
     for failure in failures:
         sheet = contact_sheet(failure.shown, per_row=_PER_ROW, truth="seen")
@@ -798,167 +852,25 @@ def gallery(failures: Sequence[Failure]) -> UInt8[np.ndarray, "H W 3"]:
     return np.vstack([np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=255) for b in blocks])
 
 
-REPORT_FILE = "report.json"
-_FACTOR = "factor_"  # and its name: a part
-_Results = dict[str, list[TaskResult]]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class EstimateEvaluationStep:
-    """How far an evaluation is.
-
-    Attributes:
-        done: parts of tasks finished.
-        total: parts of tasks in all.
-        note: what is being done.
-        report: with the last step only.
-    """
-
-    done: int
-    total: int
-    note: str
-    report: EstimateReport | None = None
-
-
-def evaluate_estimate(
-    config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[EstimateEvaluationStep]:
-    """Measure every part that is asked for, task by task; pictures and report.json go to `config.folder`.
-
-    Args:
-        config: what to measure.
-        fields: of the objects and the table.
-        assets: meshes, for the simulator.
-        executor: does tasks side by side, if given; then their times are those of a busy machine.
-
-    Raises:
-        UnknownName, MissingAssets: if an object lacks a field or a mesh, or no factor is called so.
-        InvalidInput: if a number is out of range.
-        WorkerDied: if a worker process ended.
-        CorruptFile, CannotWrite: as files are.
-    """
-    runner = TaskRunner(config, _checked(config, fields, assets), fields, assets)
-    kept: _Results = {}
-    jobs = _jobs(config, runner, kept)
-    total, done = sum(count for _, count, _ in jobs.values()), 0
-    for key, (title, count, work) in jobs.items():
-        for results in results_of([work(number) for number in range(count)], executor):
-            kept[key] = [result for result in results if result is not None]
-            if (ready := len(kept[key])) < count:
-                yield EstimateEvaluationStep(done + ready, total, f"{title} ({ready + 1} of {count})")
-        done += count
-    report = _report(kept)
-    write_plots(config.folder, report)
-    _galleries(config, kept)
-    write_json(config.folder / REPORT_FILE, report.to_json())
-    yield EstimateEvaluationStep(total, total, "Everything is measured", report)
-
-
-_Job = tuple[str, int, Callable[[int], Piece]]  # what it is called, how many, and one of them
-
-
-def _jobs(config: EvaluateEstimate, runner: TaskRunner, kept: _Results) -> dict[str, _Job]:
-    """What there is to do, in order; tracks and goals begin with the first frames in `kept`."""
-    tasks = config.tasks
-    jobs: dict[str, _Job] = {"first": ("First frames", tasks, runner.first)}
-    if "track" in config.parts:
-        jobs["track"] = "Tracks", tasks, lambda number: runner.track(number, kept["first"][number])
-    if "goal" in config.parts:
-        jobs["goal"] = "Goals", tasks, lambda number: runner.goal(number, kept["first"][number])
-    if "ablations" in config.parts:
-        jobs["fixed_light"] = "Light held overhead", tasks, runner.fixed_light
-        for views in VIEWS:
-            jobs[f"views_{views}"] = f"{views} of 4 views", tasks, _few_views(runner, views)
-    for factor in config.factors:
-        jobs[f"{_FACTOR}{factor}"] = f"Factor {factor}", tasks, _varied(runner, factor)
-    if config.bad:
-        jobs["bad"] = "Bad cases", config.bad, runner.bad
-    return jobs
-
-
-def _few_views(runner: TaskRunner, views: int) -> Callable[[int], Piece]:
-    return lambda number: runner.few_views(number, views)
-
-
-def _varied(runner: TaskRunner, factor: str) -> Callable[[int], Piece]:
-    return lambda number: runner.varied(number, factor)
-
-
-def _checked(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    """The objects to draw from, after everything asked for was found possible."""
-    check_ranges(
-        ("number of tasks", config.tasks, 1, MAX_TASKS),
-        ("number of bad cases", config.bad, 0, MAX_TASKS),
-        ("objects in a scene", config.objects, 1, MAX_OBJECTS),
-    )
-    check_seed(config.seed)
-    for part in config.parts:
-        if part not in PARTS:
-            raise InvalidInput("part", part, f"one of {', '.join(PARTS)}")
-    for factor in config.factors:
-        factor_named(factor)  # raises UnknownName
-    image_side(config.size)
-    known = tuple(name for name in fields.names() if assets.has(name))
-    if config.names is None and not known:
-        raise MissingAssets(list(fields.names()))
-    names = known if config.names is None else tuple(dict.fromkeys(config.names))
-    for name in names:
-        fields.info(name)  # raises UnknownName
-    missing = [name for name in names if not assets.has(name)]
-    if missing:
-        assets.info(missing[0])
-        raise MissingAssets(missing)
-    least = config.objects + (1 if config.bad else 0)  # a bad case calls an object by another's name
-    if len(names) < least:
-        raise InvalidInput("number of names", len(names), f"{least} or more for {config.objects} objects in a scene")
-    if config.bad and config.objects < 2:
-        raise InvalidInput("objects in a scene", config.objects, "2 or more with bad cases, which swap masks")
-    return names
-
-
-def _report(kept: _Results) -> EstimateReport:
-    def frames(key: str) -> tuple[FrameScore, ...]:
-        return tuple(decode(FrameScore, result.figures["score"], "score") for result in kept[key])
-
-    tracks = kept.get("track")
-    bad = kept.get("bad")
-    return EstimateReport(
-        first=frames("first"),
-        tracks=None
-        if tracks is None
-        else tuple(decode(TrackScore, result.figures["score"], "score") for result in tracks),
-        goals=tuple(map(_goal_scores, kept["goal"])) if "goal" in kept else None,
-        fixed_light=frames("fixed_light") if "fixed_light" in kept else None,
-        views={views: frames(f"views_{views}") for views in VIEWS} if "fixed_light" in kept else None,
-        bad=None if bad is None else tuple(decode(BadScore, result.figures["score"], "score") for result in bad),
-        factors={key.removeprefix(_FACTOR): frames(key) for key in kept if key.startswith(_FACTOR)},
-    )
-
-
-def _goal_scores(result: TaskResult) -> tuple[FrameScore, ...]:
-    return tuple(decode(FrameScore, score, "score") for score in result.figures["scores"])
-
-
-def _galleries(config: EvaluateEstimate, kept: _Results) -> None:
-    """What went wrong, each part in a picture of its own."""
-    folder = config.folder
-    factors = [key for key in kept if key.startswith(_FACTOR)]
-    for key in ("first", "fixed_light", *(f"views_{views}" for views in VIEWS), *factors):
-        if key in kept:
-            scores = [decode(FrameScore, result.figures["score"], "score") for result in kept[key]]
-            failures = [frame_failure(f"task {n}", score, kept[key][n].shown) for n, score in enumerate(scores)]
+def _write_galleries(folder: Path, report: EstimateReport, kept: Mapping[str, Sequence[TaskResult]]) -> None:
+    """Draw the failures of each part that was measured in a picture of its own."""
+    rows: list[tuple[str, str, Callable[..., Failure | None], Sequence[Any] | None]] = [
+        ("first", "task", frame_failure, report.first),
+        ("fixed_light", "task", frame_failure, report.fixed_light),
+        *((f"views_{n}", "task", frame_failure, frames) for n, frames in (report.views or {}).items()),
+        *((f"{_FACTOR}{name}", "task", frame_failure, frames) for name, frames in report.factors.items()),
+        ("track", "task", track_failure, report.tracks),
+        ("bad", "bad case", bad_failure, report.bad),
+    ]
+    for key, title, failure, scores in rows:
+        if scores is not None:
+            pairs = enumerate(zip(scores, kept[key], strict=True))
+            failures = [failure(f"{title} {n}", score, result.shown) for n, (score, result) in pairs]
             write_gallery(folder / f"failures_{key}.png", failures)
-    if "track" in kept:
-        tracks = [decode(TrackScore, result.figures["score"], "score") for result in kept["track"]]
-        failures = [track_failure(f"task {n}", score, kept["track"][n].shown) for n, score in enumerate(tracks)]
-        write_gallery(folder / "failures_track.png", failures)
-    if "goal" in kept:
-        failures = []
-        for n, result in enumerate(kept["goal"]):
-            for m, (score, shown) in enumerate(zip(_goal_scores(result), result.shown, strict=True)):
-                failures.append(frame_failure(f"task {n}, goal with {m + 1} moved", score, (shown,)))
+    if report.goals is not None:
+        failures = [
+            frame_failure(f"task {n}, goal with {m + 1} moved", score, (shown,))
+            for n, (goals, result) in enumerate(zip(report.goals, kept["goal"], strict=True))
+            for m, (score, shown) in enumerate(zip(goals, result.shown, strict=True))
+        ]
         write_gallery(folder / "failures_goal.png", failures)
-    if "bad" in kept:
-        bad = [decode(BadScore, result.figures["score"], "score") for result in kept["bad"]]
-        failures = [bad_failure(f"bad case {n}", score, kept["bad"][n].shown) for n, score in enumerate(bad)]
-        write_gallery(folder / "failures_bad.png", failures)

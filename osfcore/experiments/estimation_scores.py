@@ -1,4 +1,4 @@
-"""How good estimates are: errors of one frame, of a tracked episode, and what many of them amount to.
+"""Scores of estimates: errors of one frame and of a tracked episode, and figures of many of them.
 
 An object's pose is right if it is off by less than 1 cm and 5 deg, symmetries considered. Whatever an estimator refused
 counts as wrong in every share and is left out of medians, which would have no number for it. A wrong first pose stays
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.experiments.estimation_tasks import Absence
+from osfcore.experiments.statistics import mean
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.metrics.pose_errors import adds, direction_components, rotation_components
 from osfcore.objects.asset import ObjectAsset
@@ -28,7 +29,7 @@ _MOST_RATIO = 1e6  # of an error over a deviation of 0
 
 @dataclass(frozen=True, slots=True)
 class ObjectScore:
-    """One object's estimate.
+    """Errors of one object's estimate.
 
     Attributes:
         name: of the object.
@@ -40,7 +41,7 @@ class ObjectScore:
         rotation_ratios: the same of the rotation vector; two numbers for a body of revolution.
         flagged: the estimator doubts this object; or it doubts the whole without naming an object.
         doubt: why, in its words.
-        absent: why no image tells where the object is; "" where some does.
+        absent: why no image shows the object; "" where one does.
     """
 
     name: str
@@ -56,13 +57,13 @@ class ObjectScore:
 
     @property
     def is_right(self) -> bool:
-        """Under 1 cm and 5 deg."""
+        """Whether the pose is off by less than 1 cm and 5 deg."""
         return is_right(self.position_mm, self.rotation_deg)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameScore:
-    """The estimate of one frame or goal.
+    """Errors of the estimate of one frame or goal.
 
     Attributes:
         names: the objects in it.
@@ -84,20 +85,20 @@ class FrameScore:
 
     @property
     def is_right(self) -> bool:
-        """All objects are."""
+        """Whether all objects are right."""
         return not self.refused and all(score.is_right for score in self.objects)
 
 
 @dataclass(frozen=True, slots=True)
 class TrackScore:
-    """An episode, step by step; each list has one row for each step and in it one entry for each object.
+    """Errors of an episode; each list has one row for each step and in it one entry for each object.
 
     Attributes:
         names: the objects.
-        right_at_start: those whose first pose was.
+        right_at_start: whether their first poses were right.
         position_mm: distances from the true positions [mm].
         rotation_deg: angles, symmetries considered [deg].
-        absent: why no image tells where an object is; "" where some does.
+        absent: why no image shows an object; "" where one does.
         doubted: whether the estimator doubts an object.
         seconds: that each step's estimate took.
         moved_m: how far each object came from its first place [m].
@@ -116,26 +117,25 @@ class TrackScore:
 
     @property
     def lost_at(self) -> tuple[int | None, ...]:
-        """For each object the step at which its track counts as lost, from 0; None where it is kept."""
+        """The step at which the track of each object counts as lost, from 0; None where it is kept."""
         if self.refused:
             return (0,) * len(self.names)
-        rows = zip(*(zip(*table, strict=True) for table in (self.position_mm, self.rotation_deg, self.absent)),
-                   strict=True)  # fmt: skip
-        return tuple(lost_at(position, rotation, absent) for position, rotation, absent in rows)
+        by_object = (zip(*table, strict=True) for table in (self.position_mm, self.rotation_deg, self.absent))
+        return tuple(map(lost_at, *by_object))
 
 
 def is_right(position_mm: float, rotation_deg: float) -> bool:
-    """Under 1 cm and 5 deg."""
+    """Return whether a pose is off by less than 1 cm and 5 deg."""
     return position_mm < RIGHT_MM and rotation_deg < RIGHT_DEG
 
 
 def lost_at(position_mm: Sequence[float], rotation_deg: Sequence[float], absent: Sequence[Absence]) -> int | None:
-    """The first step at which one object was over 3 cm or 20 deg off for two steps running; None if never.
+    """Return the first step at which an object was over 3 cm or 20 deg off for two steps running; None if never.
 
     Args:
         position_mm: errors, step by step [mm].
         rotation_deg: likewise, symmetries considered [deg].
-        absent: why no image told where the object was; such a step is neither off nor kept: it interrupts the run.
+        absent: why no image shows the object; "" where one does. A step without an image interrupts the run.
 
     Returns:
         The second of the two steps, from 0.
@@ -151,12 +151,12 @@ def lost_at(position_mm: Sequence[float], rotation_deg: Sequence[float], absent:
 def pose_errors(
     estimate: SceneState, truth: SceneState, assets: Mapping[str, ObjectAsset]
 ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """Errors of position [mm] and rotation [deg], objects in the order of the estimate.
+    """Return the errors of position [mm] and rotation [deg], objects in the order of the estimate.
 
     Args:
         estimate: poses of objects.
         truth: of the same objects, in any order.
-        assets: by name; they tell which rotations look alike.
+        assets: by name; their symmetries say which rotations look alike.
     """
     shift, turn = [], []
     for name in estimate.names:
@@ -174,7 +174,7 @@ def score_frame(
     seconds: float,
     absent: Sequence[Absence] | None = None,
 ) -> FrameScore:
-    """The scores of one estimate.
+    """Score one estimate.
 
     Args:
         estimate: of the objects of the truth, in any order.
@@ -194,7 +194,7 @@ def score_frame(
 
 
 def refused_frame(names: tuple[str, ...], reason: str, seconds: float) -> FrameScore:
-    """The score of a frame that the estimator would not look at.
+    """Score a frame that the estimator refused.
 
     Args:
         names: the objects in it.
@@ -205,7 +205,7 @@ def refused_frame(names: tuple[str, ...], reason: str, seconds: float) -> FrameS
 
 
 def flags(estimate: EstimatedState) -> tuple[bool, ...]:
-    """Which objects the estimator warns of; a warning that names none is one of them all."""
+    """Return which objects the estimator warns of; a warning that names none is one of them all."""
     doubted = tuple(bool(doubt) for doubt in estimate.doubts)
     return doubted if any(doubted) else (not estimate.trusted,) * len(doubted)
 
@@ -233,40 +233,22 @@ def _object(estimate: EstimatedState, n: int, truth: SceneState, asset: ObjectAs
 
 
 def _ratios(errors: np.ndarray, deviation: float) -> tuple[float, ...]:
-    """|error| / deviation; 0 for a boundless deviation."""
+    """Return |error| / deviation; 0 for a boundless deviation."""
     return tuple(np.minimum(np.abs(errors) / max(deviation, 1e-300), _MOST_RATIO).tolist())
 
 
-# What many scores amount to
+# Figures of many scores
 
 
 def objects_of(frames: Iterable[FrameScore]) -> list[ObjectScore]:
-    """All objects that were estimated."""
+    """Return the scores of all objects that were estimated."""
     return [score for frame in frames for score in frame.objects]
 
 
 def share_right(frames: Sequence[FrameScore]) -> float | None:
-    """Share of all objects, also those of refused frames, that are right; None without objects."""
+    """Return the share of all objects, also those of refused frames, that are right; None without objects."""
     total = sum(len(frame.names) for frame in frames)
     return sum(score.is_right for score in objects_of(frames)) / total if total else None
-
-
-def median(values: Iterable[float | None]) -> float | None:
-    """Of the values that there are; None without any."""
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
-
-
-def quantile(values: Iterable[float], share: float) -> float | None:
-    """The value below which a share of the values lie; None without any."""
-    known = list(values)
-    return float(np.quantile(known, share)) if known else None
-
-
-def share(truths: Iterable[bool]) -> float | None:
-    """Share of them that hold; None without any."""
-    known = list(truths)
-    return sum(known) / len(known) if known else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +267,7 @@ class Ratios:
 
     @property
     def pooled(self) -> tuple[float, ...]:
-        """All of them."""
+        """All of them in one row."""
         return self.position + self.rotation + self.light
 
 
@@ -300,14 +282,14 @@ def ratios_of(frames: Sequence[FrameScore]) -> Ratios:
 
 
 def coverage(ratios: Iterable[float]) -> float | None:
-    """Share within two standard deviations; None without any."""
-    return share(ratio <= COVERED for ratio in ratios)
+    """Return the share within two standard deviations; None without ratios."""
+    return mean(ratio <= COVERED for ratio in ratios)
 
 
 def flagged_shares(frames: Sequence[FrameScore]) -> tuple[float | None, float | None]:
-    """Share of right object estimates that are flagged, and of wrong ones; None where there is no such estimate."""
+    """Return the share of right object estimates that are flagged, and of wrong ones; None without such estimates."""
     scores = objects_of(frames)
     return (
-        share(score.flagged for score in scores if score.is_right),
-        share(score.flagged for score in scores if not score.is_right),
+        mean(score.flagged for score in scores if score.is_right),
+        mean(score.flagged for score in scores if not score.is_right),
     )

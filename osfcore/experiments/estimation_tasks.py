@@ -1,8 +1,13 @@
-"""Tasks for estimators: first frames, episodes and goals with their truth, and inputs that should be refused."""
+"""Tasks for estimators: first frames, episodes and goals with their truth, and inputs that should be refused.
+
+A task begins with a random scene under a hidden light (`Draw`), which every function here puts together anew: the
+same draw is the same scene to the last bit. Observations hold what cameras and robot report; the truth is for
+scores alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -10,24 +15,23 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.errors import InvalidInput, OverlappingObjects
+from osfcore.estimation.first_frame import FirstFrameConfig, estimate_first_calibrated
+from osfcore.estimation.goal_image import GoalImageConfig, estimate_goal
+from osfcore.estimation.objective import ObjectModels
+from osfcore.estimation.steps import EstimateStep
+from osfcore.estimation.tracking import TrackingConfig, estimate_next
 from osfcore.experiments.factors import Factor
+from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import SCENE_CENTRE, Camera, default_cameras, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
-from osfcore.geometry.states import Observation, SceneState
+from osfcore.geometry.states import EstimatedState, Observation, SceneState
 from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.collect_pushes import DirectedPolicy
 from osfcore.world.tabletop import Tabletop
 from osfcore.world.tasks import HARSH_ELEVATION_DEG, SHIFT_M, Draw, draw_scene, opened
-
-# What estimators are measured on: first frames, episodes of pushes, and goals, with the truth kept apart from them.
-#
-# A task begins with a random scene under a hidden light (`Draw`), which every function here puts together anew: the
-# same draw is the same scene to the last bit. Observations hold what cameras and robot report; the truth is for
-# scores alone.
-
 
 STEPS = 20  # of an episode
 PUSHED_M = 0.05  # an episode in which no object comes so far is drawn again
@@ -43,7 +47,7 @@ class Frame:
     Attributes:
         observation: what an estimator may see.
         truth: what it must not see.
-        absent: for each object why no image tells where it is; "" where some does.
+        absent: for each object why no image shows it; "" where one does.
     """
 
     observation: Observation
@@ -53,7 +57,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Episode:
-    """What follows a first frame.
+    """Pushes that follow a first frame.
 
     Attributes:
         frames: after each of the steps, without masks.
@@ -82,7 +86,7 @@ class Goal:
 
 
 def first_frame(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], factor: Factor | None = None) -> Frame:
-    """The scene at rest, with masks and with the pusher in a free place.
+    """Return the scene at rest, with masks and with the pusher in a free place.
 
     Args:
         draw: the scene.
@@ -104,9 +108,9 @@ def first_frame(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], 
 
 
 def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, steps: int = STEPS) -> Episode:
-    """Pushes that follow the first frame; in the course of them some object moves by 5 cm or more.
+    """Return pushes that follow the first frame; in the course of them some object moves by 5 cm or more.
 
-    Pushes that move nothing so far are drawn again, a hundred times at most; `moved_m` tells.
+    Pushes that move nothing so far are drawn again, a hundred times at most; the last ones are taken in any case.
 
     Args:
         draw: the scene.
@@ -119,23 +123,21 @@ def episode(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...], *, s
     """
     with opened(draw, library) as world:
         start = world.truth()
-        for attempt in range(_EPISODES):
-            states, actions = _pushes(world, start, stream_rng(draw.seed, Stream.MEASURED_PUSHES, attempt), steps)
-            places = np.stack([state.poses.position[:, :2] for state in states])
-            moved = np.linalg.norm(places - start.poses.position[:, :2], axis=2).max(axis=0)
-            if moved.max() >= PUSHED_M or attempt == _EPISODES - 1:
-                frames = []
-                for state in states:
-                    world.restore(state)
-                    frames.append(take_frame(world, cameras, masks=False))
-                return Episode(tuple(frames), actions, tuple(moved.tolist()), attempt)
-    raise AssertionError("the last attempt returns")
+        attempt, (states, actions, moved) = 0, _pushes(world, start, draw.seed, 0, steps)
+        while moved.max() < PUSHED_M and attempt < _EPISODES - 1:
+            attempt += 1
+            states, actions, moved = _pushes(world, start, draw.seed, attempt, steps)
+        frames = []
+        for state in states:
+            world.restore(state)
+            frames.append(take_frame(world, cameras, masks=False))
+    return Episode(tuple(frames), actions, tuple(moved.tolist()), attempt)
 
 
 def goals(draw: Draw, library: AssetLibrary, camera: Camera) -> tuple[Goal, ...]:
-    """For each m from 1 to all objects: m of them shifted by 7.5 to 20 cm and turned about the vertical, another light.
+    """Return goals with one, two and up to all objects elsewhere, each goal under another light.
 
-    Where there is no room for an object it stays; the goal tells which ones moved.
+    These are shifted by 7.5 to 20 cm and turned about the vertical. Where there is no room for an object it stays.
 
     Args:
         draw: the scene.
@@ -161,44 +163,41 @@ def goals(draw: Draw, library: AssetLibrary, camera: Camera) -> tuple[Goal, ...]
 
 
 def take_frame(world: Tabletop, cameras: tuple[Camera, ...], *, masks: bool, with_pusher: bool = True) -> Frame:
-    """The world as it is.
+    """Return images of the world and its truth.
 
     Args:
         world: stays as it is.
         cameras: of one image size.
-        masks: whether the observation tells each object's visible pixels.
+        masks: whether the observation holds masks of each object's visible pixels.
         with_pusher: whether the pusher is seen; where not, the truth has none either.
     """
     observation = world.render(cameras, masks=True, with_pusher=with_pusher)
     truth = world.truth() if with_pusher else replace(world.truth(), pusher=None)
     assert observation.masks is not None
     pixels = observation.masks.sum(axis=(0, 2, 3)).tolist()
-    places = zip(truth.poses.position, pixels, strict=True)
-    absent: tuple[Absence, ...] = tuple(_absence(place, is_seen=count > 0) for place, count in places)
-    return Frame(observation if masks else replace(observation, masks=None), truth, absent)
-
-
-def _absence(place: np.ndarray, *, is_seen: bool) -> Absence:
-    if place[2] < 0 or np.abs(place[:2]).max() > TABLE_SIDE_M / 2:
-        return "off the table"
-    return "" if is_seen else "out of view"
+    absent: list[Absence] = []
+    for place, count in zip(truth.poses.position, pixels, strict=True):
+        is_off = place[2] < 0 or np.abs(place[:2]).max() > TABLE_SIDE_M / 2
+        absent.append("off the table" if is_off else "" if count > 0 else "out of view")
+    return Frame(observation if masks else replace(observation, masks=None), truth, tuple(absent))
 
 
 def _pushes(
-    world: Tabletop, start: SceneState, rng: np.random.Generator, steps: int
-) -> tuple[list[SceneState], Float[np.ndarray, "T 3"]]:
-    """States after each action, and the actions."""
+    world: Tabletop, start: SceneState, seed: int, attempt: int, steps: int
+) -> tuple[list[SceneState], Float[np.ndarray, "T 3"], Float[np.ndarray, "N"]]:
+    """Return the states after each action, the actions, and how far each object came from its first place [m]."""
     world.restore(start)
-    policy, states, actions = DirectedPolicy(world.assets, rng), [], []
+    policy, states, actions = DirectedPolicy(world.assets, stream_rng(seed, Stream.MEASURED_PUSHES, attempt)), [], []
     for _ in range(steps):
         actions.append(policy.action(world.truth()))
         world.act(actions[-1])
         states.append(world.truth())
-    return states, np.array(actions)
+    places = np.stack([state.poses.position[:, :2] for state in states])
+    return states, np.array(actions), np.linalg.norm(places - start.poses.position[:, :2], axis=2).max(axis=0)
 
 
 def _moved(world: Tabletop, name: str, pose: Pose, rng: np.random.Generator) -> bool:
-    """Put an object elsewhere in the workspace, lying as it lies; whether a place was found."""
+    """Put an object elsewhere in the workspace, lying as it lies, and return whether a place was found."""
     for _ in range(_PLACES):
         angle, distance, turn = rng.uniform(-np.pi, np.pi), rng.uniform(*SHIFT_M), rng.uniform(-np.pi, np.pi)
         place = pose.position + np.array([distance * np.cos(angle), distance * np.sin(angle), 0.0])
@@ -213,7 +212,7 @@ def _moved(world: Tabletop, name: str, pose: Pose, rng: np.random.Generator) -> 
     return False
 
 
-# Inputs that an estimator should refuse or doubt: what goes wrong between a camera and a program.
+# Inputs that an estimator should refuse or doubt, as faults between a camera and a program make them.
 #
 # Each case is a random scene of its own, spoiled in one way. What counts in the end is how many answers are wrong
 # and come without a warning. An answer that is right in spite of everything needs none.
@@ -234,7 +233,7 @@ class BadCase:
         kind: what is wrong with it.
         observation: what the estimator is shown.
         truth: what is there; it may hold other objects than the observation names.
-        start: for a goal, the sound first frame that tells how the objects lie; None for a first frame.
+        start: for a goal, the sound first frame that shows how the objects lie; None for a first frame.
     """
 
     kind: str
@@ -245,7 +244,7 @@ class BadCase:
 
 @dataclass(frozen=True, slots=True)
 class BadScore:
-    """What became of a bad case.
+    """An estimator's answer to a bad case.
 
     Attributes:
         kind: what was wrong with it.
@@ -267,13 +266,13 @@ class BadScore:
 
     @property
     def is_confidently_wrong(self) -> bool:
-        """Wrong without a warning."""
+        """Whether the answer is wrong and comes without a warning."""
         return not (self.refused or self.reason or self.is_right)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Scene:
-    """What a case is made of."""
+    """A scene that is not spoiled yet, and random numbers to spoil it with."""
 
     draw: Draw
     available: tuple[str, ...]
@@ -285,13 +284,13 @@ class _Scene:
         return first_frame(self.draw, self.library, self.cameras)
 
     def others(self) -> tuple[str, ...]:
-        """Names of objects that are not in the scene, in random order, as many as are in it if there are."""
+        """Return names of objects that are not in the scene, in random order, at most as many as are in it."""
         rest = [name for name in self.available if name not in self.draw.names]
         return tuple(rest[int(i)] for i in self.rng.permutation(len(rest))[: len(self.draw.names)])
 
 
 def bad_case(available: Sequence[str], count: int, seed: int, number: int, library: AssetLibrary, size: int) -> BadCase:
-    """The number-th bad case; kinds take turns.
+    """Return one bad case; kinds take turns.
 
     Args:
         available: names of objects to draw from; more than `count`.
@@ -304,15 +303,14 @@ def bad_case(available: Sequence[str], count: int, seed: int, number: int, libra
     Raises:
         UnknownName, MissingAssets, NoRoom: as scenes are made.
     """
-    kind = KINDS[number % len(KINDS)]
     draw = draw_scene(available, count, seed, FIRST_SCENE + number)
     rng = stream_rng(draw.seed, Stream.SPOILED_INPUT)
     scene = _Scene(draw, tuple(available), library, default_cameras(size), rng)
-    return _MAKERS[kind](scene)
+    return _MAKERS[KINDS[number % len(KINDS)]](scene)
 
 
 def summary(scores: Sequence[BadScore]) -> dict[str, Any]:
-    """Counts over all cases and by kind.
+    """Count answers over all cases and by kind.
 
     A case is refused, or flagged (its estimate as a whole is not trusted), or neither; right ones are counted among
     all of them.
@@ -327,9 +325,9 @@ def summary(scores: Sequence[BadScore]) -> dict[str, Any]:
             "confident_wrong": sum(s.is_confidently_wrong for s in chosen),
         }
 
-    by_kind = {kind: counts([s for s in scores if s.kind == kind]) for kind in KINDS}
+    by_kind = {kind: [s for s in scores if s.kind == kind] for kind in KINDS}
     total = {f"bad_{key}": value for key, value in counts(scores).items()}
-    return {**total, "bad_by_kind": {kind: row for kind, row in by_kind.items() if row["cases"]}}
+    return {**total, "bad_by_kind": {kind: counts(chosen) for kind, chosen in by_kind.items() if chosen}}
 
 
 def _swapped_masks(scene: _Scene) -> BadCase:
@@ -448,3 +446,54 @@ _MAKERS: dict[str, Callable[[_Scene], BadCase]] = {
     "goal from another camera": _other_camera,
 }
 KINDS = tuple(_MAKERS)
+
+
+# Warm-up: whatever is done once in a program's life, which no estimate should pay for.
+
+
+WARM_SCENE = 900_000  # number of a scene that no figure is measured on
+_FIRST = FirstFrameConfig(
+    starts=1,
+    population=4,
+    generations=1,
+    joint_population=4,
+    joint_generations=1,
+    coarse_iterations=1,
+    fine_iterations=1,
+)
+# Thresholds of 0 make both search as they do where an object does not fit.
+_NEXT = TrackingConfig(fits_below=0.0, lamp_above=0.0, sweeps=1, generations=1)
+_GOAL = GoalImageConfig(planar_iterations=1, free_iterations=1, widen_all=True)
+
+
+def warm_models(
+    names: Sequence[str], fields: FieldLibrary, library: AssetLibrary, draw: Draw, size: int, *, goal: bool = True
+) -> ObjectModels:
+    """Load the fields of objects and table, and do everything that only the first estimate would pay for.
+
+    Args:
+        names: of the objects.
+        fields: where the fields are.
+        library: where the objects' meshes are, for pictures to warm up with.
+        draw: a scene of some of the objects, on which nothing is measured.
+        size: side of the images [px].
+        goal: goals will be estimated too.
+    """
+    models = ObjectModels({name: fields.load(name) for name in names}, fields.load_table())
+    for name in names:
+        models.resting(name)
+    rng = stream_rng(0, Stream.BENCHMARK)
+    observation = first_frame(draw, library, default_cameras(size)).observation
+    state = last_estimate(estimate_first_calibrated(models, observation, rng, _FIRST)).state
+    last_estimate(estimate_next(models, replace(observation, masks=None), state, rng, _NEXT))
+    if goal:
+        view = goals(draw, library, goal_camera(size))[0].frame.observation
+        last_estimate(estimate_goal(models, view, state, _GOAL))
+    return models
+
+
+def last_estimate(steps: Iterator[EstimateStep]) -> EstimatedState:
+    """Run through the steps of an estimate, and return what the last one holds."""
+    *_, last = steps
+    assert last.estimate is not None, "the last step brings the estimate"
+    return last.estimate

@@ -1,6 +1,6 @@
 """Factors of variation, one at a time: worlds that differ in one thing from what the method takes for granted.
 
-The method is told of none of them. Taken for granted are: a distant white lamp with ambient 0.25 and diffuse 0.75, 5
+The method knows of none of them. Taken for granted are: a distant white lamp with ambient 0.25 and diffuse 0.75, 5
 deg and more above the table; a table of one known colour; exact calibration; linear images without noise; exact masks;
 friction as the dynamics were trained on; objects that they were trained on. `mild_together` are many factors at once,
 each of them small.
@@ -32,7 +32,7 @@ from osfcore.world.imaging import Lamp, TableSurface, wooden_texture
 from osfcore.world.scenes import Conditions, SceneRequest
 from osfcore.world.tabletop import Tabletop
 
-# What lies between a scene and a program: noise, compression, encodings, calibrations and masks that are a bit off.
+# Sensors: noise, compression, encodings, calibrations and masks that are a bit off.
 
 
 ImageChange = Literal["none", "noise", "jpeg", "srgb_8bit", "srgb_8bit_decoded", "srgb_noise_jpeg"]
@@ -43,7 +43,7 @@ JPEG_QUALITY = 80
 def received(
     image: Float[np.ndarray, "h w 3"], change: ImageChange, rng: np.random.Generator
 ) -> Float[np.ndarray, "h w 3"]:
-    """An image as a program gets it; whatever else happens, sensors saturate at 1.
+    """Return an image as a program gets it; whatever else happens, sensors saturate at 1.
 
     Args:
         image: linear radiance.
@@ -81,7 +81,7 @@ def _through_jpeg(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3
 
 
 def resized_masks(masks: Bool[np.ndarray, "V N h w"], radius_px: int) -> Bool[np.ndarray, "V N h w"]:
-    """Masks that reach farther by a number of pixels, or less far where it is negative; the image's border eats none.
+    """Dilate masks by a number of pixels, or erode them where it is negative, but not from the image's border.
 
     Masks that reach farther may overlap, as those of a segmentation that looks at one object after the other.
     """
@@ -96,7 +96,7 @@ def resized_masks(masks: Bool[np.ndarray, "V N h w"], radius_px: int) -> Bool[np
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CameraError:
-    """How a camera stands otherwise than its calibration tells.
+    """Difference of a camera's true pose from its calibration.
 
     Attributes:
         rotation: rotation vector about axes of the world through the optical centre [rad].
@@ -108,15 +108,15 @@ class CameraError:
 
     @staticmethod
     def random(rng: np.random.Generator, turn_rad: float, shift_m: float) -> CameraError:
-        """An error of given size, about a random axis and in a random direction."""
+        """Draw an error of given size, about a random axis and in a random direction."""
         axis, direction = rng.standard_normal((2, 3))
         return CameraError(turn_rad * axis / np.linalg.norm(axis), shift_m * direction / np.linalg.norm(direction))
 
     def applied(self, camera: Camera) -> Camera:
-        """The camera as it stands."""
-        told = camera.T_world_camera
-        quaternion = quaternion_multiply(quaternion_exp(self.rotation), told.quaternion)
-        return replace(camera, T_world_camera=Pose(told.position + self.shift, quaternion))
+        """Return the camera as it truly stands."""
+        calibrated = camera.T_world_camera
+        quaternion = quaternion_multiply(quaternion_exp(self.rotation), calibrated.quaternion)
+        return replace(camera, T_world_camera=Pose(calibrated.position + self.shift, quaternion))
 
 
 UNSEEN_NETWORK = "pushes_without_two"  # of the dynamics, trained without mustard bottle and tuna can
@@ -125,7 +125,7 @@ _SAME_RAD = 1e-6
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Factor:
-    """How a world differs from the usual one; by default in nothing.
+    """Difference of a world from the usual one; by default none.
 
     Attributes:
         conditions: lamp, table and contacts.
@@ -151,24 +151,24 @@ class Factor:
     light_elevation_deg: tuple[float, float] | None = None
 
     def light(self, light: Light, rng: np.random.Generator) -> Light:
-        """A light as high as the factor has them, at the same azimuth."""
+        """Return a light as high as the factor has them, at the same azimuth."""
         if self.light_elevation_deg is None:
             return light
         x, y, _ = light.direction
         return Light.from_angles(float(np.arctan2(y, x)), float(np.deg2rad(rng.uniform(*self.light_elevation_deg))))
 
     def camera_errors(self, rng: np.random.Generator, count: int) -> list[CameraError]:
-        """How cameras stand otherwise than they are calibrated, each in its own way."""
+        """Draw errors of calibration, for each camera its own."""
         return [CameraError.random(rng, self.camera_turn_rad, self.camera_shift_m) for _ in range(count)]
 
     def drawn_conditions(self, rng: np.random.Generator) -> Conditions:
-        """Lamp, table and contacts; the wood is drawn anew."""
+        """Return lamp, table and contacts; wood is drawn anew."""
         if not self.has_wooden_table:
             return self.conditions
         return replace(self.conditions, table=TableSurface(texture=wooden_texture(rng)))
 
     def received(self, taken: Observation, cameras: tuple[Camera, ...], rng: np.random.Generator) -> Observation:
-        """What a program gets of pictures.
+        """Return pictures as a program gets them.
 
         Args:
             taken: by cameras as they stand.
@@ -181,7 +181,7 @@ class Factor:
         return replace(taken, cameras=cameras, images=images, masks=masks)
 
     def task(self, task: RearrangementTask, rng: np.random.Generator) -> RearrangementTask:
-        """A task under such lights; where start and goal share one, they still do."""
+        """Return a task under the factor's lights; where start and goal share one, they still do."""
         start = self.light(task.start.light, rng)
         is_same = task.goal.light.angle_to(task.start.light) < _SAME_RAD
         goal = start if is_same else self.light(task.goal.light, rng)
@@ -191,7 +191,7 @@ class Factor:
 def _lamp(
     *, ambient: float | None = None, intensity: float = 1.0, colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
 ) -> Factor:
-    """A factor of the lamp; a share of ambient light takes from the diffuse light."""
+    """Return a factor of the lamp; a share of ambient light takes from the diffuse light."""
     lamp = Lamp(intensity=intensity, colour=colour)
     if ambient is not None:
         lamp = replace(lamp, ambient=ambient, diffuse=1 - ambient)
@@ -235,9 +235,7 @@ FACTORS: Mapping[str, Factor] = MappingProxyType(
     }
 )
 _FIRST_FRAME_ONLY = ("exposure_0.7", "exposure_1.4", "ambient_0.6", "table_dark", "mild_together")
-EPISODE_FACTORS = tuple(
-    name for name in FACTORS if name not in _FIRST_FRAME_ONLY
-)  # in which whole episodes are measured
+EPISODE_FACTORS = tuple(name for name in FACTORS if name not in _FIRST_FRAME_ONLY)  # measured in whole episodes
 FIRST_FRAME_FACTORS = (
     "exposure_0.7", "exposure_1.4", "ambient_0.1", "ambient_0.6", "srgb_8bit", "table_dark", "table_wood",
     "table_colour", "noise_2", "jpeg_80", "camera_shifted", "masks_dilated_2", "masks_eroded_2", "mild_together",
@@ -245,7 +243,7 @@ FIRST_FRAME_FACTORS = (
 
 
 def factor_named(name: str) -> Factor:
-    """One of the factors.
+    """Return the factor of a name.
 
     Raises:
         UnknownName: if there is none of that name.
@@ -293,7 +291,7 @@ class VariedWorld:
     # The World protocol
 
     def reset(self, seed: int) -> Observation:
-        """A new random scene at rest.
+        """Put a new random scene on the table, at rest.
 
         Raises:
             NoRoom: if the objects do not fit side by side.
@@ -303,8 +301,8 @@ class VariedWorld:
         return self.observe()
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """One image per camera, as the method gets them, with the cameras as they are calibrated."""
-        return self._received(self._world.observe(masks=masks), self.cameras)
+        """Return one image per camera, as the method gets them, with the cameras as they are calibrated."""
+        return self._factor.received(self._world.observe(masks=masks), self.cameras, self._rng)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
         """Hold the pusher velocity (vx, vy, 0) [m/s] for 0.2 s.
@@ -321,7 +319,7 @@ class VariedWorld:
     # What only a simulator can do
 
     def goal_image(self, state: SceneState, camera: Camera) -> GoalImage:
-        """A state as a camera shows it to the method, without the pusher; the table is left like that.
+        """Return a state as a camera shows it to the method, without the pusher; the table is left like that.
 
         Args:
             state: put on the table, as by `restore`.
@@ -330,7 +328,7 @@ class VariedWorld:
         self.restore(state)
         standing = self._goal_error.applied(camera)
         taken = self._world.render((standing,), with_pusher=False)
-        return GoalImage(camera, self._received(taken, (camera,)).images[0])
+        return GoalImage(camera, self._factor.received(taken, (camera,), self._rng).images[0])
 
     def restore(self, state: SceneState) -> None:
         """Put back a state, its light as well.
@@ -341,12 +339,9 @@ class VariedWorld:
         self._world.restore(state)
 
     def truth(self) -> SceneState:
-        """The true state, for scores; the method must not see it."""
+        """Return the true state, for scores; the method must not see it."""
         return self._world.truth()
 
     def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
-        """The present state under the factor's lamp and on its table, but by ideal cameras, for scores and pictures."""
+        """Return images of the present state under the factor's lamp, but by ideal cameras, for scores and pictures."""
         return self._world.render(cameras, masks=masks, with_pusher=with_pusher)
-
-    def _received(self, taken: Observation, cameras: tuple[Camera, ...]) -> Observation:
-        return self._factor.received(taken, cameras, self._rng)

@@ -1,4 +1,4 @@
-"""Long evaluations: independent tasks on any executor, results kept on disk, and intervals of figures."""
+"""Run long evaluations: checks of what is asked for, results kept on disk, and independent pieces on any executor."""
 
 from __future__ import annotations
 
@@ -6,31 +6,147 @@ import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from dataclasses import fields as fields_of
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap
 
-from osfcore.errors import CorruptFile, WorkerDied
+from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, WorkerDied, check_ranges, check_seed
 from osfcore.fields.devices import computing_threads
+from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.table import TableField
+from osfcore.geometry.cameras import image_side
 from osfcore.inspection.contact_sheet import Comparison
 from osfcore.io.files import write_atomically, write_json
-from osfcore.random_streams import Stream, stream_rng
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.tasks import Draw
+
+MAX_TASKS = 10_000
+ReportT = TypeVar("ReportT")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EvaluationStep(Generic[ReportT]):
+    """Progress of an evaluation.
+
+    Attributes:
+        done: parts finished.
+        total: parts in all.
+        note: what is being done.
+        report: all figures, with the last step only.
+    """
+
+    done: int
+    total: int
+    note: str
+    report: ReportT | None = None
+
+
+# Checks of what is asked for.
+
+
+def check_run(tasks: int, seed: int, *limits: tuple[str, float, float, float], size: int | None = None) -> None:
+    """Check the settings that most evaluations have.
+
+    Args:
+        tasks: number of tasks, 1 or more.
+        seed: of everything random.
+        limits: further numbers, as `check_ranges` takes them.
+        size: side of the images [px], if there are any.
+
+    Raises:
+        InvalidInput: if a number is out of range.
+    """
+    check_ranges(("number of tasks", tasks, 1, MAX_TASKS), *limits)
+    check_seed(seed)
+    if size is not None:
+        image_side(size)
+
+
+def measurable(fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+    """Return the names of all objects with both a field and a mesh.
+
+    Raises:
+        InvalidInput: if there is no field at all.
+        MissingAssets: if there are fields, but no mesh for any.
+    """
+    known = fields.names()
+    if not known:
+        raise InvalidInput("number of trained fields", 0, "1 or more: train one with 'osf train field'")
+    names = tuple(name for name in known if assets.has(name))
+    if not names:
+        raise MissingAssets(known)
+    return names
+
+
+def chosen_objects(names: Iterable[str] | None, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
+    """Return the objects to draw from: those named, each once and in this order, or all measurable ones if None.
+
+    Raises:
+        UnknownName: if a named object has no field.
+        MissingAssets: if one has no mesh on this machine.
+        InvalidInput: if there is no field at all.
+    """
+    if names is None:
+        return measurable(fields, assets)
+    chosen = tuple(dict.fromkeys(names))
+    for name in chosen:
+        fields.info(name)  # raises UnknownName
+    missing = [name for name in chosen if not assets.has(name)]
+    if missing:
+        assets.info(missing[0])  # raises UnknownName
+        raise MissingAssets(missing)
+    return chosen
+
+
+# What results depend on.
+
+
+def file_sha256(path: Path) -> str:
+    """Return the checksum of a file.
+
+    Raises:
+        CorruptFile: if it cannot be read.
+    """
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise CorruptFile(path, "it cannot be read") from error
+
+
+def table_sha256(table: TableField) -> str:
+    """Return the checksum of a table's weights."""
+    arrays = [np.asarray(getattr(table, entry.name)).tobytes() for entry in fields_of(table)]
+    return hashlib.sha256(b"".join(arrays)).hexdigest()
+
+
+def scene_circumstances(draw: Draw, fields: FieldLibrary, assets: AssetLibrary) -> dict[str, Any]:
+    """Return what all figures of a scene depend on, as plain JSON: fields, meshes, table, arrangement and light.
+
+    Raises:
+        UnknownName, MissingAssets, CorruptFile: if a field or a mesh cannot be read.
+    """
+    return {
+        "weights": {name: file_sha256(fields.info(name).path) for name in draw.names},
+        "assets": {name: assets.digest(name) for name in draw.names},
+        "table": table_sha256(fields.load_table()),
+        "arrangement": draw.seed,
+        "light": draw.light.direction.tolist(),
+    }
+
 
 # Results of finished tasks on disk, so that a long evaluation can be killed, resumed and run in pieces.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TaskResult:
-    """What one task left.
+    """Result of one task.
 
     Attributes:
         figures: plain JSON.
@@ -52,11 +168,11 @@ class TaskCache:
         self.folder = folder
 
     def read(self, name: str, circumstances: Mapping[str, Any]) -> TaskResult | None:
-        """The result of a task, or None if it has to be done (again).
+        """Return the result of a task, or None if it has to be done (again).
 
         Args:
             name: of the task.
-            circumstances: plain JSON that tells everything the result depends on; another one makes it stale.
+            circumstances: plain JSON of everything the result depends on; a result with other ones is stale.
         """
         try:
             content = json.loads((self.folder / f"{name}.json").read_text())
@@ -93,135 +209,15 @@ class TaskCache:
         write_json(self.folder / f"{name}.json", {"circumstances": circumstances, "figures": result.figures})
 
 
-def file_sha256(path: Path) -> str:
-    """What a result that depends on a file depends on.
-
-    Raises:
-        CorruptFile: if it cannot be read.
-    """
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise CorruptFile(path, "it cannot be read") from error
-
-
-def table_sha256(table: TableField) -> str:
-    """The same of a table."""
-    arrays = [np.asarray(getattr(table, entry.name)).tobytes() for entry in fields_of(table)]
-    return hashlib.sha256(b"".join(arrays)).hexdigest()
-
-
-# Intervals of shares and means, and paired tests between methods that were given the same tasks.
-
-
-_LEVEL = 0.95
-_RESAMPLES = 9999
-
-
-def share_interval(successes: int, tasks: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
-    limits = binomtest(successes, tasks).proportion_ci(_LEVEL, method="wilson")
-    return float(limits.low), float(limits.high)
-
-
-def mean_interval(values: Sequence[float]) -> list[float] | None:
-    """Return the percentile bootstrap's 95 % interval of a mean (Efron 1979).
-
-    Returns:
-        None where all values are equal, or there is one alone: nothing says how far the next one would be.
-    """
-    if len(values) < 2 or np.ptp(values) == 0:
-        return None
-    rng = stream_rng(0, Stream.BOOTSTRAP)
-    found = bootstrap(
-        (np.asarray(values, float),), np.mean, n_resamples=_RESAMPLES, confidence_level=_LEVEL, method="percentile",
-        rng=rng,
-    )  # fmt: skip
-    return [float(found.confidence_interval.low), float(found.confidence_interval.high)]
-
-
-def compare_shares(ours: Sequence[bool], others: Sequence[bool]) -> dict[str, Any]:
-    """Successes of two methods on the same tasks.
-
-    Args:
-        ours: of one method, task by task.
-        others: of the other one.
-
-    Returns:
-        "difference" of the shares, Newcombe's 95 % "interval" of a paired difference, and "p" of McNemar's exact test:
-        how likely tasks in which only one of both succeeds are shared out so unevenly if both are equally good.
-    """
-    pairs = list(zip(ours, others, strict=True))
-    both, neither = pairs.count((True, True)), pairs.count((False, False))
-    only_ours, only_others = pairs.count((True, False)), pairs.count((False, True))
-    differing = only_ours + only_others
-    return {
-        "difference": (only_ours - only_others) / len(pairs),
-        "interval": list(_newcombe(both, only_ours, only_others, neither)),
-        "p": float(binomtest(only_ours, differing).pvalue) if differing else 1.0,
-    }
-
-
-def _newcombe(both: int, only_ours: int, only_others: int, neither: int) -> tuple[float, float]:
-    """The interval of the difference of two paired shares (Newcombe 1998, method 10), from Wilson's of each of them."""
-    tasks = both + only_ours + only_others + neither
-    ours, others = both + only_ours, both + only_others
-    (low, high), (other_low, other_high) = share_interval(ours, tasks), share_interval(others, tasks)
-    below, above = ours / tasks - low, high - ours / tasks
-    other_below, other_above = others / tasks - other_low, other_high - others / tasks
-    spread = np.sqrt(float(ours * others) * (tasks - ours) * (tasks - others))
-    excess = both * neither - only_ours * only_others
-    corrected = max(excess - tasks / 2, 0) if excess > 0 else excess
-    phi = corrected / spread if spread else 0.0
-    difference = (only_ours - only_others) / tasks
-    down = np.sqrt(below**2 - 2 * phi * below * other_above + other_above**2)
-    up = np.sqrt(above**2 - 2 * phi * above * other_below + other_below**2)
-    return float(difference - down), float(difference + up)
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """The p of several tests, corrected for their number (Holm 1979): the k-th smallest of m counts m - k + 1 times."""
-    corrected, least = [0.0] * len(p_values), 0.0
-    for rank, n in enumerate(np.argsort(p_values)):
-        least = max(least, min(1.0, (len(p_values) - rank) * p_values[n]))
-        corrected[n] = least
-    return corrected
-
-
-def compare_means(ours: Sequence[float], others: Sequence[float]) -> dict[str, Any]:
-    """Return the mean "difference" of two methods on the same tasks and its "interval", see `mean_interval`."""
-    differences = [a - b for a, b in zip(ours, others, strict=True)]
-    return {"difference": float(np.mean(differences)), "interval": mean_interval(differences)}
-
-
-# Pieces of a long evaluation: independent, done by any `concurrent.futures.Executor`, kept as soon as they are
-# done.
+# Independent pieces of an evaluation, done by any `concurrent.futures.Executor` and kept as soon as they are done.
 #
-# Whatever runs them, a result reaches the disk of the process that asked for it and nothing else does: workers may
-# be on other machines, and a piece whose worker dies is done again by an executor that can (Dask's does) or by the
-# next run.
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class EvaluationStep:
-    """How far an evaluation is.
-
-    Attributes:
-        done: pieces finished.
-        total: pieces in all.
-        note: what is being done.
-        report: all figures as plain JSON, with the last step only.
-    """
-
-    done: int
-    total: int
-    note: str
-    report: dict[str, Any] | None = None
+# Only the process that asked for a result writes it to disk: workers may be on other machines. A piece whose worker
+# dies is done again by an executor that can (Dask's does) or by the next run.
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One of them.
+    """One independent part of an evaluation.
 
     Attributes:
         name: of its files.
@@ -236,17 +232,17 @@ class Piece:
     work: Callable[[], TaskResult]
 
     def kept(self) -> TaskResult | None:
-        """What it left when it was done before."""
+        """Return the result of an earlier run, if there is one."""
         return self.cache.read(self.name, self.circumstances)
 
 
 def results_of(pieces: Sequence[Piece], executor: Executor | None = None) -> Iterator[list[TaskResult | None]]:
-    """Do what is not done yet; yields what there is so far, in the order of the pieces, after each that was done.
+    """Do what is not done yet, and yield all results so far, in the order of the pieces, after each that was done.
 
     Args:
         pieces: no two of one name and cache.
-        executor: does them, each in one thread, if given; else this process does, one after the other, with torch in
-            one thread as in episodes, so that the results are the same.
+        executor: does them, each in one thread, if given. Otherwise this process does one after the other, with torch
+            in one thread as in episodes, so that the results are the same.
 
     Raises:
         WorkerDied: if a worker process ended; what was done until then is kept.
@@ -263,8 +259,8 @@ def results_of(pieces: Sequence[Piece], executor: Executor | None = None) -> Ite
 
 def finished(
     pieces: Sequence[Piece], executor: Executor | None, what: str
-) -> Generator[EvaluationStep, None, list[TaskResult]]:
-    """Do what is not done yet, telling how far it is.
+) -> Generator[EvaluationStep[Any], None, list[TaskResult]]:
+    """Do what is not done yet, and yield progress.
 
     Args:
         pieces: no two of one name and cache.

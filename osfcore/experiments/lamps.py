@@ -1,4 +1,9 @@
-"""How far lamps that photographs tell are from true ones, in simulated scenes; poses are estimated from masks alone."""
+"""Compare lamps that are estimated from simulated photographs with true ones; poses come from masks alone.
+
+Three objects lie on a table under a lamp: a near one with a cone, or a distant one for comparison. Up to four views
+are taken, exposed such that little is saturated, with a white balance of their own, noise, and eight bits of sRGB.
+Masks are exact.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +17,8 @@ import numpy as np
 
 from osfcore.errors import check_ranges, check_seed
 from osfcore.estimation.camera_response import linear_from_encoded, srgb_of_linear
+from osfcore.experiments.harness import EvaluationStep
+from osfcore.experiments.statistics import mean, median, spread
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light, SpotLamp
@@ -29,12 +36,6 @@ from osfcore.random_streams import Stream, stream_rng, stream_seed
 from osfcore.world.imaging import Lamp, TableSurface, wooden_texture
 from osfcore.world.scenes import Conditions, SceneRequest
 from osfcore.world.tabletop import Tabletop
-
-# Simulated photographs of a table under a lamp: near ones with a cone, and distant ones for comparison.
-#
-# Three objects lie on the table; up to four views are taken, exposed such that little is saturated, with a white
-# balance of their own, noise, and eight bits of sRGB. Masks are exact.
-
 
 _OBJECTS = 3
 _SIDE = 320  # of a photograph [px]
@@ -68,7 +69,7 @@ class LampScene:
 def lamp_scene(
     library: AssetLibrary, among: Sequence[str], seed: int, number: int, views: int, *, is_near: bool, is_wooden: bool
 ) -> LampScene:
-    """One scene and its photographs.
+    """Draw a scene and take its photographs.
 
     Args:
         library: of meshes.
@@ -101,7 +102,7 @@ def lamp_scene(
 
 
 def random_spot(rng: np.random.Generator) -> SpotLamp:
-    """A near lamp that looks at the table, about its centre."""
+    """Draw a near lamp that is aimed at the table, about its centre."""
     distance = float(np.exp(rng.uniform(*np.log(_DISTANCES_M))))
     azimuth, elevation = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(*_ELEVATIONS_DEG))
     aim = np.array([*rng.uniform(-_AIM_M, _AIM_M, 2), 0.0])
@@ -111,7 +112,7 @@ def random_spot(rng: np.random.Generator) -> SpotLamp:
 
 
 def _taken(observed: Observation, view: int, rng: np.random.Generator) -> Photograph:
-    """A view as a camera stores it."""
+    """Return a view as a camera stores it."""
     assert observed.masks is not None
     image, camera = observed.images[view], observed.cameras[view]
     gain = rng.uniform(*_LEVEL) / np.percentile(image, _BRIGHT) * np.exp(rng.normal(0, _BALANCE, 3))
@@ -124,9 +125,13 @@ def _taken(observed: Observation, view: int, rng: np.random.Generator) -> Photog
     return Photograph(linear, exposed, camera.intrinsics, camera.T_world_camera, True, masks)
 
 
+# The evaluation.
+
+
 _RIGHT_DEG, _RIGHT_PERCENT = 5.0, 15.0
 _CLOSE_M, _CLOSE_DEG = 0.015, 10.0
 _FAR_EVERY = 4  # near lamps there is a distant one
+_OF = ("mean", "median", "p90", "max")
 _MOST_TASKS = 1000
 _MOST_VIEWS = 4
 
@@ -150,16 +155,16 @@ class EvaluateLamps:
 
 @dataclass(frozen=True, slots=True)
 class LampScore:
-    """One scene.
+    """Errors of the lamp of one scene.
 
     Attributes:
         number: of the scene.
         is_near: whether its lamp is near.
         is_wooden: whether its table has a grain.
         direction_deg: error of the direction, seen from the table's centre.
-        std_deg: that was told of it.
+        std_deg: its estimated standard deviation.
         true_m: distance from there; None for a distant lamp.
-        distance_m: that was found; None if it was said to be unknown.
+        distance_m: that was estimated; None if it cannot be determined.
         is_diffuse: the light was called diffuse.
         poses: objects that were found.
         right_poses: of them, those within 15 mm and 10 deg, symmetries counted.
@@ -180,56 +185,36 @@ class LampScore:
 
     @property
     def distance_percent(self) -> float | None:
-        """Error of the distance, of the true one; None where either is unknown."""
+        """Error of the distance as a share of the true one [%]; None where either is unknown."""
         if self.true_m is None or self.distance_m is None:
             return None
         return 100 * abs(self.distance_m / self.true_m - 1)
 
 
-@dataclass(frozen=True, slots=True)
-class LampReport:
-    """All figures; None where nothing tells.
-
-    Attributes:
-        scores: of each scene.
-    """
-
-    scores: tuple[LampScore, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """Figures by name, and the scores that they come from."""
-        near, far = ([s for s in self.scores if s.is_near is is_near] for is_near in (True, False))
-        angles = [s.direction_deg for s in near]
-        known = [p for s in near if (p := s.distance_percent) is not None]
-        return {
-            "lamp_tasks": len(near),
-            **_figures("lamp_direction_deg", angles),
-            **_figures("lamp_distance_percent", known),
-            "lamp_undetermined": sum(s.distance_m is None for s in near),
-            "lamp_diffuse": sum(s.is_diffuse for s in near),
-            "lamp_within_5deg": _mean([a <= _RIGHT_DEG for a in angles]),
-            "lamp_within_15percent": _mean([p <= _RIGHT_PERCENT for p in known]),
-            "distant_tasks": len(far),
-            **_figures("distant_direction_deg", [s.direction_deg for s in far]),
-            "distant_undetermined": sum(s.distance_m is None for s in far),
-            "poses_total": sum(s.poses for s in self.scores),
-            "poses_15mm_10deg": sum(s.right_poses for s in self.scores) / max(sum(s.poses for s in self.scores), 1),
-            "lamp_s_median": float(np.median([s.seconds for s in self.scores])) if self.scores else None,
-            "scores": [asdict(s) for s in self.scores],
-        }
+def lamp_report(scores: Sequence[LampScore]) -> dict[str, Any]:
+    """Return figures by name, None where nothing is known, and the scores that they come from."""
+    near, far = ([s for s in scores if s.is_near is is_near] for is_near in (True, False))
+    angles = [s.direction_deg for s in near]
+    known = [p for s in near if (p := s.distance_percent) is not None]
+    return {
+        "lamp_tasks": len(near),
+        **spread("lamp_direction_deg", angles, _OF),
+        **spread("lamp_distance_percent", known, _OF),
+        "lamp_undetermined": sum(s.distance_m is None for s in near),
+        "lamp_diffuse": sum(s.is_diffuse for s in near),
+        "lamp_within_5deg": mean(a <= _RIGHT_DEG for a in angles),
+        "lamp_within_15percent": mean(p <= _RIGHT_PERCENT for p in known),
+        "distant_tasks": len(far),
+        **spread("distant_direction_deg", [s.direction_deg for s in far], _OF),
+        "distant_undetermined": sum(s.distance_m is None for s in far),
+        "poses_total": sum(s.poses for s in scores),
+        "poses_15mm_10deg": sum(s.right_poses for s in scores) / max(sum(s.poses for s in scores), 1),
+        "lamp_s_median": median(s.seconds for s in scores),
+        "scores": [asdict(s) for s in scores],
+    }
 
 
-@dataclass(frozen=True, slots=True)
-class LampsStep:
-    """How far an evaluation is; the last step brings the report."""
-
-    done: int
-    total: int
-    note: str
-    report: LampReport | None = None
-
-
-def evaluate_lamps(config: EvaluateLamps, library: AssetLibrary, fields: FieldLibrary) -> Iterator[LampsStep]:
+def evaluate_lamps(config: EvaluateLamps, library: AssetLibrary, fields: FieldLibrary) -> Iterator[EvaluationStep]:
     """Estimate the lamps of random scenes; report.json goes to `config.folder`.
 
     Args:
@@ -248,14 +233,14 @@ def evaluate_lamps(config: EvaluateLamps, library: AssetLibrary, fields: FieldLi
     cases = [(True, k) for k in range(config.tasks)] + [(False, k) for k in range(-(-config.tasks // _FAR_EVERY))]
     scores: list[LampScore] = []
     for done, (is_near, number) in enumerate(cases):
-        yield LampsStep(done, len(cases), f"A {'near' if is_near else 'distant'} lamp")
+        yield EvaluationStep(done, len(cases), f"A {'near' if is_near else 'distant'} lamp")
         wooden = bool(number % 2)
         scene = lamp_scene(library, names, config.seed, number, config.views, is_near=is_near, is_wooden=wooden)
         rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, number, int(is_near))
         scores.append(_score(models, scene, number, rng, is_wooden=wooden))
-    report = LampReport(tuple(scores))
-    write_json(config.folder / "report.json", report.to_json())
-    yield LampsStep(len(cases), len(cases), "Everything is measured", report)
+    report = lamp_report(scores)
+    write_json(config.folder / "report.json", report)
+    yield EvaluationStep(len(cases), len(cases), "Everything is measured", report)
 
 
 def _score(
@@ -266,29 +251,22 @@ def _score(
     start = time.perf_counter()
     found = photo_lamp(scene.photos, last.found, surfels)
     seconds = time.perf_counter() - start
-    angle = float(np.rad2deg(np.arccos(np.clip(found.direction @ scene.direction, -1, 1))))
-    true_m = None if scene.spot is None else scene.spot.distance
-    distance_m = found.distance if found.distance_known else None
-    std_deg = float(np.rad2deg(found.std))
-    is_near, right = scene.spot is not None, sum(_is_right(one, scene.poses[one.name]) for one in last.found)
-    return LampScore(number, is_near, is_wooden, angle, std_deg, true_m, distance_m, found.is_diffuse,
-                     len(last.found), right, seconds)  # fmt: skip
+    return LampScore(
+        number=number,
+        is_near=scene.spot is not None,
+        is_wooden=is_wooden,
+        direction_deg=float(np.rad2deg(np.arccos(np.clip(found.direction @ scene.direction, -1, 1)))),
+        std_deg=float(np.rad2deg(found.std)),
+        true_m=None if scene.spot is None else scene.spot.distance,
+        distance_m=found.distance if found.distance_known else None,
+        is_diffuse=found.is_diffuse,
+        poses=len(last.found),
+        right_poses=sum(_is_right(one, scene.poses[one.name]) for one in last.found),
+        seconds=seconds,
+    )
 
 
 def _is_right(found: PhotoObject, truth: Pose) -> bool:
     pose = found.best.pose
     turn_rad = float(rotation_error(CATALOGUE[found.name].symmetry, pose.quaternion, truth.quaternion))
     return bool(np.linalg.norm(pose.position - truth.position) <= _CLOSE_M and np.rad2deg(turn_rad) <= _CLOSE_DEG)
-
-
-def _figures(name: str, values: Sequence[float]) -> dict[str, float | None]:
-    """Mean, median, 90th percentile and the largest."""
-    if not values:
-        return {f"{name}_{what}": None for what in ("mean", "median", "p90", "max")}
-    mean, median, p90 = np.mean(values), np.median(values), np.quantile(values, 0.9)
-    return {f"{name}_mean": float(mean), f"{name}_median": float(median), f"{name}_p90": float(p90),
-            f"{name}_max": float(max(values))}  # fmt: skip
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return float(np.mean(values)) if values else None

@@ -1,4 +1,16 @@
-"""Poses in real photographs: how well objects fit their masks, measured depth and reference poses; and lamps."""
+"""Measure poses in real photographs against masks, measured depth and reference poses; and lamps.
+
+A photographed scene is a folder with photo.json:
+
+    {"image": file, "encoding": "sRGB" or "linear", "K": 3 x 3 [px], pixel centres at +0.5,
+     "masks": {object: file}, in which more than 127 is the object,
+     "depth": file, 16 bit, and "depth_unit_m"; may be missing,
+     "poses_camera_object": {source: {object: {"position": [3], "quaternion": [w, x, y, z]}}}}
+
+The source "ground_truth" is the truth; without one, "posecnn_refined_with_depth" stands for it. A folder of lamps
+holds folders chrome, gray and others, each with NAME.mask.png and linear images NAME.K.png; those with the same K
+show the same lamp. Its direction is that of the highlight on the chrome ball.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +22,13 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from pydantic import Field, FiniteFloat
 
 from osfcore.errors import CorruptFile, InvalidInput, check_ranges, check_seed
 from osfcore.estimation.camera_response import linear_from_encoded
+from osfcore.experiments.harness import EvaluationStep
+from osfcore.experiments.statistics import mean, quantile
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, unit_quaternion
 from osfcore.inspection.contact_sheet import write_sheet
@@ -30,20 +44,6 @@ from osfcore.photo.segmentation import Box, propose_masks
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
-
-# Folders with photographs and what is known of them.
-#
-# A photographed scene is a folder with photo.json:
-#
-#     {"image": file, "encoding": "sRGB" or "linear", "K": 3 x 3 [px], pixel centres at +0.5,
-#      "masks": {object: file}, in which more than 127 is the object,
-#      "depth": file, 16 bit, and "depth_unit_m"; may be missing,
-#      "poses_camera_object": {source: {object: {"position": [3], "quaternion": [w, x, y, z]}}}}
-#
-# The source "ground_truth" is the truth; without one, "posecnn_refined_with_depth" stands for it. A folder of lamps
-# holds folders chrome, gray and others, each with NAME.mask.png and linear images NAME.K.png; those with the same K
-# show the same lamp. Its direction is that of the highlight on the chrome ball.
-
 
 PHOTO_FILE = "photo.json"
 GROUND_TRUTH, REFINED = "ground_truth", "posecnn_refined_with_depth"
@@ -91,7 +91,7 @@ class PhotoFolder:
         return self.poses.get(GROUND_TRUTH) or self.poses.get(REFINED) or {}
 
     def table_points(self) -> Float[np.ndarray, "P 3"]:
-        """Measured points around the objects, in the camera's frame [m]."""
+        """Return the measured points around the objects, in the camera's frame [m]; depth has to be known."""
         assert self.depth is not None
         objects = np.any(list(self.photo.masks.values()), axis=0).astype(np.uint8)
         around, margin = (cv2.dilate(objects, np.ones((side, side), np.uint8)) > 0 for side in (81, 13))
@@ -118,12 +118,12 @@ class LampSubject:
 
 
 def scene_folders(data: Path) -> tuple[Path, ...]:
-    """Folders of photographed scenes in a folder, or the folder itself, in order of name."""
+    """Return the folders of photographed scenes in a folder, or the folder itself, in order of name."""
     return tuple(sorted(path.parent for path in (*data.glob(PHOTO_FILE), *data.glob(f"*/{PHOTO_FILE}"))))
 
 
 def lamp_folders(data: Path) -> tuple[Path, ...]:
-    """Folders with a chrome ball under several lamps, likewise."""
+    """Return the folders with a chrome ball under several lamps, in order of name."""
     return tuple(sorted(path.parents[1] for path in data.glob(f"**/{_MIRROR}/{_MIRROR}.mask.png")))
 
 
@@ -149,7 +149,7 @@ def read_scene(folder: Path) -> PhotoFolder:
 
 
 def read_lamps(folder: Path) -> tuple[LampSubject, ...]:
-    """All things of a folder of lamps but the chrome ball.
+    """Read all things of a folder of lamps but the chrome ball.
 
     Raises:
         CorruptFile: as files are.
@@ -173,7 +173,7 @@ def read_lamps(folder: Path) -> tuple[LampSubject, ...]:
 
 
 def sphere_normals(mask: Bool[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Normals of a sphere that a distant camera sees, in its frame, and pixels that are not seen at a grazing angle."""
+    """Return the normals of a sphere in the frame of a distant camera, and the pixels not seen at a grazing angle."""
     rows, columns = np.nonzero(mask)
     centre = np.array([columns.min() + columns.max() + 1, rows.min() + rows.max() + 1]) / 2
     radius = (np.ptp(rows) + np.ptp(columns) + 2) / 4
@@ -208,14 +208,14 @@ _RIGHT_MM, _RIGHT_DEG, _DEPTH_MM = 15.0, 10.0, 10.0
 
 @dataclass(frozen=True, slots=True)
 class PhotoScore:
-    """One object in one photograph.
+    """Errors of one object in one photograph.
 
     Attributes:
         scene: the photograph's folder.
         name: of the object.
         is_true: the reference is the truth, not another program's answer.
         iou: of the field's silhouette and the mask.
-        depth_mm: median of drawn minus measured depth; None without measured depth.
+        depth_mm: median of rendered minus measured depth; None without measured depth.
         position_mm: distance from the reference; None without one.
         rotation_deg: angle to it, symmetries counted.
         doubt: why the pose should not be trusted; "" where it may be.
@@ -249,68 +249,43 @@ class PhotoScore:
         return self.is_turned_right and self.position_mm is not None and self.position_mm <= _RIGHT_MM
 
 
-@dataclass(frozen=True, slots=True)
-class PhotoReport:
-    """All figures; None where nothing tells.
+def photo_report(
+    scores: Sequence[PhotoScore], lamps_deg: Mapping[str, Sequence[float]], without_field: int
+) -> dict[str, Any]:
+    """Return figures by name, None where nothing is known, and the scores that they come from.
 
-    Attributes:
+    Args:
         scores: of each search.
         lamps_deg: error of each lamp, by what it shone on.
-        without_field: objects that have no field and were left out.
+        without_field: number of objects that have no field and were left out.
     """
-
-    scores: tuple[PhotoScore, ...]
-    lamps_deg: Mapping[str, tuple[float, ...]]
-    without_field: int
-
-    def to_json(self) -> dict[str, Any]:
-        """Figures by name, and the scores that they come from."""
-        scores, true = self.scores, [s for s in self.scores if s.is_true]
-        referred = [s for s in scores if s.rotation_deg is not None]
-        depths = [abs(s.depth_mm) for s in scores if s.depth_mm is not None]
-        lamps = [error for errors in self.lamps_deg.values() for error in errors]
-        return {
-            "objects_total": len(scores),
-            "objects_without_field": self.without_field,
-            "iou_median": _median([s.iou for s in scores]),
-            "iou_mean": _mean([s.iou for s in scores]),
-            "iou_min": min((s.iou for s in scores), default=None),
-            "mask_iou_median": _median([s.mask_iou for s in scores]),
-            "mask_iou_min": min((s.mask_iou for s in scores), default=None),
-            "depth_within_10mm": _mean([d <= _DEPTH_MM for d in depths]),
-            "depth_mm_median": _median(depths),
-            "frac_15mm_10deg": _mean([s.is_right for s in true]),
-            "frac_10deg": _mean([s.is_turned_right for s in referred]),
-            "wrong_unflagged": sum(not s.is_turned_right and not s.doubt for s in referred),
-            "right_flagged": sum(s.is_turned_right and bool(s.doubt) for s in referred),
-            "light_deg_median": _median(lamps),
-            "light_deg_max": max(lamps, default=None),
-            "light_deg": {name: [round(e, 2) for e in errors] for name, errors in self.lamps_deg.items()},
-            "refine_s_median": _median([s.refine_s for s in scores]),
-            "refine_s_p95": _quantile([s.refine_s for s in scores], 0.95),
-            "coarse_s_median": _median([s.coarse_s for s in scores]),
-            "coarse_s_p95": _quantile([s.coarse_s for s in scores], 0.95),
-            "scores": [asdict(s) for s in scores],
-        }
-
-
-def report_of(
-    scores: Sequence[PhotoScore], lamps_deg: Mapping[str, Sequence[float]], without_field: int
-) -> PhotoReport:
-    """The report of an evaluation."""
-    return PhotoReport(tuple(scores), {name: tuple(errors) for name, errors in lamps_deg.items()}, without_field)
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return float(np.mean(values)) if values else None
-
-
-def _median(values: Sequence[float]) -> float | None:
-    return _quantile(values, 0.5)
-
-
-def _quantile(values: Sequence[float], q: float) -> float | None:
-    return float(np.quantile(values, q)) if values else None
+    referred = [s for s in scores if s.rotation_deg is not None]
+    depths = [abs(s.depth_mm) for s in scores if s.depth_mm is not None]
+    lamps = [error for errors in lamps_deg.values() for error in errors]
+    refine_s, coarse_s = [s.refine_s for s in scores], [s.coarse_s for s in scores]
+    return {
+        "objects_total": len(scores),
+        "objects_without_field": without_field,
+        "iou_median": quantile([s.iou for s in scores], 0.5),
+        "iou_mean": mean(s.iou for s in scores),
+        "iou_min": min((s.iou for s in scores), default=None),
+        "mask_iou_median": quantile([s.mask_iou for s in scores], 0.5),
+        "mask_iou_min": min((s.mask_iou for s in scores), default=None),
+        "depth_within_10mm": mean(d <= _DEPTH_MM for d in depths),
+        "depth_mm_median": quantile(depths, 0.5),
+        "frac_15mm_10deg": mean(s.is_right for s in scores if s.is_true),
+        "frac_10deg": mean(s.is_turned_right for s in referred),
+        "wrong_unflagged": sum(not s.is_turned_right and not s.doubt for s in referred),
+        "right_flagged": sum(s.is_turned_right and bool(s.doubt) for s in referred),
+        "light_deg_median": quantile(lamps, 0.5),
+        "light_deg_max": max(lamps, default=None),
+        "light_deg": {name: [round(e, 2) for e in errors] for name, errors in lamps_deg.items()},
+        "refine_s_median": quantile(refine_s, 0.5),
+        "refine_s_p95": quantile(refine_s, 0.95),
+        "coarse_s_median": quantile(coarse_s, 0.5),
+        "coarse_s_p95": quantile(coarse_s, 0.95),
+        "scores": [asdict(s) for s in scores],
+    }
 
 
 # How far estimated lamps are from true ones, on things of known shape.
@@ -327,7 +302,7 @@ _SATURATED_PIXEL, _LEAST_ALBEDO = 0.98, 0.05
 
 
 def lamp_errors_deg(subject: LampSubject) -> list[float]:
-    """Angle between estimated and true lamp of each image [deg]."""
+    """Return the angle between estimated and true lamp of each image [deg]."""
     errors = []
     for number, (image, direction) in enumerate(zip(subject.images, subject.directions, strict=True)):
         albedo, normals, shown = _surface(subject, number)
@@ -339,7 +314,7 @@ def lamp_errors_deg(subject: LampSubject) -> list[float]:
 
 
 def _surface(subject: LampSubject, left_out: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Albedo, normals and usable pixels of a thing, without one of its images."""
+    """Return albedo, normals and usable pixels of a thing, from all its images but one."""
     if subject.name == BALL:
         normals, shown = sphere_normals(subject.mask)
         return np.ones_like(normals), normals, shown
@@ -368,7 +343,7 @@ LOOSE = 0.04  # of the box's sides, on each side: people do not draw to the pixe
 
 
 def box_and_click(mask: Bool[np.ndarray, "h w"]) -> tuple[Box, Float[np.ndarray, "1 2"]]:
-    """A loose box around a mask, and the point of it that is farthest from its border [px]."""
+    """Return a loose box around a mask, and the point of the mask that is farthest from its border [px]."""
     rows, columns = np.nonzero(mask)
     left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
     across, down = LOOSE * (right - left), LOOSE * (bottom - top)
@@ -380,25 +355,24 @@ def box_and_click(mask: Bool[np.ndarray, "h w"]) -> tuple[Box, Float[np.ndarray,
 
 
 def masks_from_boxes(scene: PhotoFolder) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """What GrabCut makes of a box and a click for each mask of a scene.
+    """Return what GrabCut makes of a box and a click for each mask of a scene.
 
     Raises:
         InvalidInput: if nothing is found in a box.
     """
-    picture = _eight_bit(scene.encoded)
+    encoded = scene.encoded if scene.encoded.dtype == np.uint8 else (scene.encoded // 257).astype(np.uint8)
     marks = {name: box_and_click(mask) for name, mask in scene.photo.masks.items()}
     boxes, clicks = {name: box for name, (box, _) in marks.items()}, {name: on for name, (_, on) in marks.items()}
-    return propose_masks(picture, boxes, clicks)
+    return propose_masks(np.ascontiguousarray(encoded), boxes, clicks)
 
 
 def mask_iou(used: Photograph, given: Photograph, name: str) -> float:
-    """Intersection over union of the mask that was searched with and the given one."""
+    """Return the intersection over union of the mask that was searched with and the given one."""
     mine, its = used.masks[name], given.masks[name]
     return float((mine & its).sum() / (mine | its).sum())
 
 
-def _eight_bit(encoded: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
-    return np.ascontiguousarray(encoded if encoded.dtype == np.uint8 else (encoded // 257).astype(np.uint8))
+# The evaluation.
 
 
 NONE, PERTURBED = "none", "perturbed"
@@ -436,17 +410,7 @@ class EvaluatePhotos:
     masks: Literal["given", "boxes"] = "given"
 
 
-@dataclass(frozen=True, slots=True)
-class PhotosStep:
-    """How far an evaluation is; the last step brings the report."""
-
-    done: int
-    total: int
-    note: str
-    report: PhotoReport | None = None
-
-
-def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[PhotosStep]:
+def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[EvaluationStep]:
     """Look for every object of every folder, then for the lamps; report.json and sheets go to `config.folder`.
 
     Args:
@@ -474,16 +438,16 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ph
     models, renderer = PhotoModels(loaded), SceneRenderer(loaded, None)
     scores: list[PhotoScore] = []
     for done, (scene, names, number) in enumerate(cases):
-        yield PhotosStep(done, len(cases), f"{len(names)} objects in {scene.name}")
+        yield EvaluationStep(done, len(cases), f"{len(names)} objects in {scene.name}")
         scores += _measure(config, models, renderer, scene, names, number)
     lamp_errors = {subject.name: lamp_errors_deg(subject) for path in lamps for subject in read_lamps(path)}
-    report = report_of(scores, lamp_errors, without)
-    write_json(config.folder / "report.json", report.to_json())
-    yield PhotosStep(len(cases), len(cases), "Everything is measured", report)
+    report = photo_report(scores, lamp_errors, without)
+    write_json(config.folder / "report.json", report)
+    yield EvaluationStep(len(cases), len(cases), "Everything is measured", report)
 
 
 def _names(config: EvaluatePhotos, scene: PhotoFolder, known: set[str]) -> list[str]:
-    """Objects of a scene that are looked for."""
+    """Return the objects of a scene that are looked for."""
     source = GROUND_TRUTH if config.start == PERTURBED else config.start
     return [n for n in scene.photo.masks if n in known and (config.start == NONE or n in scene.poses.get(source, {}))]
 
@@ -511,7 +475,7 @@ def _measure(
 
 
 def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject, mask_iou: float) -> PhotoScore:
-    """Compare an object, its pose in the camera's frame, with all that is known."""
+    """Compare an object, its pose in the camera's frame, with mask, depth and reference pose."""
     name, pose = found.name, found.best.pose
     iou, depth_mm = _fit(renderer, scene, name, pose)
     position_mm = rotation_deg = None
@@ -519,9 +483,21 @@ def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject, mask
         symmetry = CATALOGUE[name].symmetry
         rotation_deg = float(np.rad2deg(rotation_error(symmetry, pose.quaternion, reference.quaternion)))
         position_mm = 1e3 * float(np.linalg.norm(pose.position - reference.position))
-    is_true = GROUND_TRUTH in scene.poses
-    return PhotoScore(scene.name, name, is_true, iou, depth_mm, position_mm, rotation_deg, found.doubt,
-                      min(found.ratio, 99.0), found.coarse_s, found.refine_s, mask_iou)  # fmt: skip
+    ratio = found.rivals[0].loss / max(found.best.loss, 1e-9) if found.rivals else np.inf
+    return PhotoScore(
+        scene=scene.name,
+        name=name,
+        is_true=GROUND_TRUTH in scene.poses,
+        iou=iou,
+        depth_mm=depth_mm,
+        position_mm=position_mm,
+        rotation_deg=rotation_deg,
+        doubt=found.doubt,
+        ratio=min(ratio, 99.0),
+        coarse_s=found.coarse_s,
+        refine_s=found.refine_s,
+        mask_iou=mask_iou,
+    )
 
 
 def _photo(config: EvaluatePhotos, scene: PhotoFolder) -> Photograph:
@@ -552,19 +528,19 @@ def _start(config: EvaluatePhotos, scene: PhotoFolder, name: str, rng: np.random
 
 
 def _fit(renderer: SceneRenderer, scene: PhotoFolder, name: str, pose: Pose) -> tuple[float, float | None]:
-    """IoU of the field's silhouette with the mask, where that is known, and median depth error within both [mm]."""
+    """Return IoU of the field's silhouette with the mask, where that is known, and median depth error [mm]."""
     window = object_windows([scene.photo], name, max(scene.photo.image.shape))[0]
     camera = window.camera(name)
-    batch = SceneBatch((name,), pose.position[None, None], pose.quaternion[None, None], -pose.position[None] /
-                       np.linalg.norm(pose.position), None)  # fmt: skip
+    toward_camera = -pose.position[None] / np.linalg.norm(pose.position)
+    batch = SceneBatch((name,), pose.position[None, None], pose.quaternion[None, None], toward_camera, None)
     drawn = renderer.render(batch, [camera], outputs={"rgb", "masks", "depth"})
     assert drawn.masks is not None
     assert drawn.depth is not None
     shown = drawn.masks[0, 0, 0]
     both, either = shown & window.mask & window.known, (shown | window.mask) & window.known
+    iou = float(both.sum() / either.sum())
     if scene.depth is None:
-        return float(both.sum() / either.sum()), None
+        return iou, None
     measured = window.frame.cut(scene.depth.astype(np.float32))
     common = shown & window.mask & (measured > 0)
-    error = 1e3 * np.median(drawn.depth[0, 0][common] - measured[common]) if common.any() else None
-    return float(both.sum() / either.sum()), None if error is None else float(error)
+    return iou, float(1e3 * np.median(drawn.depth[0, 0][common] - measured[common])) if common.any() else None

@@ -17,14 +17,10 @@ import torch
 from jaxtyping import Float
 
 from osfcore.dynamics.shapes import ObjectShape, solid_shape
-from osfcore.errors import OsfError, check_ranges, check_seed
-from osfcore.experiments.harness import (
-    compare_means,
-    compare_shares,
-    mean_interval,
-    share_interval,
-    torch_in_one_thread,
-)
+from osfcore.errors import check_ranges, check_seed
+from osfcore.experiments.harness import EvaluationStep, torch_in_one_thread
+from osfcore.experiments.statistics import compare_means, compare_shares, mean_interval, share_interval
+from osfcore.extras import need
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.rollouts import MAX_HORIZON, Rollouts
@@ -51,96 +47,68 @@ PX_M = 0.001  # 1 px is 1 mm: then the pusher's radius of 15 px is that of ours
 Step = Callable[[Float[np.ndarray, "K 7"], Float[np.ndarray, "K 2"]], Float[np.ndarray, "K 7"]]
 
 
-class MissingPushT(OsfError):
-    """The benchmark is not installed."""
+class _Plane:
+    """One instance of the environment, whose actions are made of velocities.
 
-    def __init__(self) -> None:
-        super().__init__(
-            "Push-T needs gym-pusht and pytorch-mppi; install them with: pip install 'osf-manipulation[pusht]' && "
-            "pip install --no-deps gym-pusht==0.1.8."
-        )
-
-
-class _Instance:
-    """One instance of the environment; its pusher is told velocities.
-
-    Attributes:
-        env: of gym-pusht, which has no types.
-        steps: of the environment in one of our actions.
-        substeps: of the physics in one of those.
+    Raises:
+        MissingExtra: if gym-pusht is not installed.
     """
 
     def __init__(self) -> None:
+        need("pusht", "Push-T")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # it would be printed among the figures
-        try:
-            from gym_pusht.envs.pusht import PushTEnv  # pyright: ignore[reportMissingImports]  an extra
-        except ImportError:
-            raise MissingPushT from None
-        self.env: Any = PushTEnv()
-        self.env.reset(seed=0)
-        self.steps = round(STEP_S * self.env.control_hz)
-        self.substeps = int(1 / (self.env.dt * self.env.control_hz))  # as in its own step
-        space = self.env.action_space
+        from gym_pusht.envs.pusht import PushTEnv  # pyright: ignore[reportMissingImports]  an extra
+
+        self._env: Any = PushTEnv()  # it has no types
+        self._env.reset(seed=0)
+        self._steps = round(STEP_S * self._env.control_hz)  # of the environment in one of our actions
+        self._substeps = int(1 / (self._env.dt * self._env.control_hz))  # of the physics in one of those
+        space = self._env.action_space
         self._low, self._high, self._lead_px = float(space.low.min()), float(space.high.max()), self._lead_s() / PX_M
 
     @property
     def state(self) -> Float[np.ndarray, "7"]:
-        """Where everything is."""
-        agent, block = self.env.agent, self.env.block
+        """Where pusher and T are."""
+        agent, block = self._env.agent, self._env.block
         return np.array([*agent.position, *agent.velocity, *block.position, block.angle])
 
-    def target(self, velocity: Float[np.ndarray, "2"]) -> tuple[float, float]:
-        """The environment's action that lets the pusher keep a velocity [m/s], within the plane."""
-        x, y = self.env.agent.position
-        return self._within(x + self._lead_px * velocity[0]), self._within(y + self._lead_px * velocity[1])
-
-    def _within(self, at: float) -> float:
-        return min(max(float(at), self._low), self._high)
+    def _target(self, velocity: Float[np.ndarray, "2"]) -> list[float]:
+        """Return the environment's action that lets the pusher keep a velocity [m/s], within the plane."""
+        pairs = zip(self._env.agent.position, velocity, strict=True)
+        return [min(max(float(at + self._lead_px * v), self._low), self._high) for at, v in pairs]
 
     def _lead_s(self) -> float:
-        """How far ahead a target is of a pusher that moves by its velocity u times the duration h of each step [s].
+        """Return how far ahead a target is of a pusher that moves by its velocity u times the duration h of a step [s].
 
         A step multiplies (x - target, v) by P. Then v is the same before and after it for v = -P10 lead u / (1 - P11),
         and x moves by h u.
         """
-        dt, k_p, k_v = self.env.dt, self.env.k_p, self.env.k_v
+        dt, k_p, k_v = self._env.dt, self._env.k_p, self._env.k_v
         one = np.array([[1 - k_p * dt**2, dt - k_v * dt**2], [-k_p * dt, 1 - k_v * dt]])
-        P = np.linalg.matrix_power(one, self.substeps)
-        return float(self.substeps * dt / (1 - P[0, 0] - P[0, 1] * P[1, 0] / (1 - P[1, 1])))
+        P = np.linalg.matrix_power(one, self._substeps)
+        return float(self._substeps * dt / (1 - P[0, 0] - P[0, 1] * P[1, 0] / (1 - P[1, 1])))
 
 
-class PushT:
-    """The environment that is acted on.
-
-    Raises:
-        MissingPushT: if gym-pusht is not installed.
-    """
-
-    def __init__(self) -> None:
-        self._own = _Instance()
+class PushT(_Plane):
+    """The environment that is acted on."""
 
     def reset(self, seed: int) -> None:
         """Begin anew, as the environment draws it from a seed."""
-        self._own.env.reset(seed=seed)
-
-    @property
-    def state(self) -> Float[np.ndarray, "7"]:
-        """Where pusher and T are."""
-        return self._own.state
+        self._env.reset(seed=seed)
 
     @property
     def goal(self) -> Float[np.ndarray, "3"]:
         """Where the T should be: origin [px] and angle [rad]."""
-        return np.asarray(self._own.env.goal_pose, float)
+        return np.asarray(self._env.goal_pose, float)
 
     @property
     def success_coverage(self) -> float:
         """Share of the goal that the T has to cover."""
-        return float(self._own.env.success_threshold)
+        return float(self._env.success_threshold)
 
     def coverage(self) -> float:
-        """Share of the goal that the T covers."""
-        return float(self._own.env._get_coverage())
+        """Return the share of the goal that the T covers."""
+        return float(self._env._get_coverage())
 
     def act(self, velocity: Float[np.ndarray, "2"]) -> float:
         """Execute one action, unless the goal is reached half-way.
@@ -152,44 +120,38 @@ class PushT:
             The largest coverage at the end of one of the environment's steps.
         """
         most = 0.0
-        for _ in range(self._own.steps):
-            *_, is_done, _, info = self._own.env.step(np.array(self._own.target(velocity)))
+        for _ in range(self._steps):
+            *_, is_done, _, info = self._env.step(np.array(self._target(velocity)))
             most = max(most, float(info["coverage"]))
             if is_done:
                 break
         return most
 
 
-class Simulation:
+class Simulation(_Plane):
     """Another instance of the environment, put into any state: the true dynamics.
 
-    The physics engine warm-starts its contact solver with the impulses of the step before, which are in no state: what
-    is foretold of an action differs from what happens by a fraction of a pixel, by more where the T is jammed against a
-    wall.
-
-    Raises:
-        MissingPushT: if gym-pusht is not installed.
+    The physics engine warm-starts its contact solver with the impulses of the step before, which are in no state. So
+    the prediction of an action differs from what happens by a fraction of a pixel, by more where the T is jammed
+    against a wall.
     """
-
-    def __init__(self) -> None:
-        self._own = _Instance()
 
     def __call__(
         self, states: Float[np.ndarray, "K 7"], velocities: Float[np.ndarray, "K 2"]
     ) -> Float[np.ndarray, "K 7"]:
-        """States after one action each [m/s]."""
+        """Return the states after one action each [m/s]."""
         return np.array([self._after(state, velocity) for state, velocity in zip(states, velocities, strict=True)])
 
     def _after(self, state: Float[np.ndarray, "7"], velocity: Float[np.ndarray, "2"]) -> Float[np.ndarray, "7"]:
         self._forget_contacts()
         self._put(state.tolist())
-        for _ in range(self._own.steps):
-            self._follow(*self._own.target(velocity))
-        return self._own.state
+        for _ in range(self._steps):
+            self._follow(*self._target(velocity))
+        return self.state
 
     def _forget_contacts(self) -> None:
         """Let a moment pass in which nothing is near anything, and keep no contact from before it."""
-        env = self._own.env
+        env = self._env
         env.agent.velocity = env.block.velocity = (0.0, 0.0)
         env.agent.position, env.block.position = (-1e3, -1e3), (1e3, 1e3)
         kept, env.space.collision_persistence = env.space.collision_persistence, 0
@@ -197,16 +159,16 @@ class Simulation:
         env.space.collision_persistence = kept
 
     def _put(self, state: list[float]) -> None:
-        agent, block = self._own.env.agent, self._own.env.block
+        agent, block = self._env.agent, self._env.block
         agent.position, agent.velocity = tuple(state[:2]), tuple(state[2:4])
         block.angle = state[6]  # first, for it turns the T about its centre of mass
         block.position = tuple(state[4:6])
         block.velocity, block.angular_velocity = (0.0, 0.0), 0.0  # which full damping makes of them in any case
 
     def _follow(self, x: float, y: float) -> None:
-        """One of the environment's steps, without the areas and observations that its own `step` computes."""
-        env, agent = self._own.env, self._own.env.agent
-        for _ in range(self._own.substeps):
+        """Take one of the environment's steps, without the areas and observations that its own `step` computes."""
+        env, agent = self._env, self._env.agent
+        for _ in range(self._substeps):
             (at_x, at_y), (v_x, v_y) = agent.position, agent.velocity
             agent.velocity = (
                 v_x + (env.k_p * (x - at_x) - env.k_v * v_x) * env.dt,
@@ -216,7 +178,7 @@ class Simulation:
 
 
 def drift(states: Float[np.ndarray, "K 7"], velocities: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 7"]:
-    """States after one action each if the pusher met nothing: dynamics that cost next to no time."""
+    """Return the states after one action each if the pusher met nothing: dynamics that cost next to no time."""
     after = states.copy()
     after[:, 2:4] = velocities / PX_M
     after[:, :2] += STEP_S * after[:, 2:4]
@@ -250,39 +212,32 @@ class PushTEpisode:
     coverage: float
     is_success: bool
     steps: int
-    plan_s: tuple[float, ...]
-    own_s: tuple[float, ...]
+    plan_s: Sequence[float]
+    own_s: Sequence[float]
 
 
-@dataclass(frozen=True, slots=True)
-class PlannerReport:
-    """All episodes, the tasks of each planner in the same order."""
+def report_json(episodes: Sequence[PushTEpisode]) -> dict[str, Any]:
+    """Return shares and coverages in [0, 1] with 95 % intervals, times in seconds, rates in plans a second.
 
-    episodes: tuple[PushTEpisode, ...]
+    Args:
+        episodes: all of them, the tasks of each planner in the same order.
 
-    def to_json(self) -> dict[str, Any]:
-        """Shares and coverages in [0, 1] with 95 % intervals, times in seconds, rates in plans a second.
-
-        Returns:
-            "tasks", "start_mean" (coverage before anything moves), "planners" by name, "against" (ours against each
-            other one, task by task) and "episodes".
-        """
-        planners = {name: self._of(name) for name in dict.fromkeys(e.planner for e in self.episodes)}
-        ours = planners.get(_OURS, [])
-        first = next(iter(planners.values()))
-        return {
-            "tasks": len(first),
-            "start_mean": float(np.mean([episode.start for episode in first])),
-            "planners": {name: _figures(episodes) for name, episodes in planners.items()},
-            "against": {name: _against(ours, other) for name, other in planners.items() if ours and name != _OURS},
-            "episodes": [
-                {"planner": e.planner, "seed": e.seed, "start": e.start, "coverage": e.coverage, "steps": e.steps}
-                for e in self.episodes
-            ],
-        }
-
-    def _of(self, planner: str) -> list[PushTEpisode]:
-        return [episode for episode in self.episodes if episode.planner == planner]
+    Returns:
+        "tasks", "start_mean" (coverage before anything moves), "planners" by name, "against" (ours against each
+        other one, task by task) and "episodes".
+    """
+    names = dict.fromkeys(e.planner for e in episodes)
+    planners = {name: [e for e in episodes if e.planner == name] for name in names}
+    first, ours = next(iter(planners.values())), planners.get(_OURS, [])
+    others = {name: rows for name, rows in planners.items() if ours and name != _OURS}
+    keys = ("planner", "seed", "start", "coverage", "steps")
+    return {
+        "tasks": len(first),
+        "start_mean": float(np.mean([episode.start for episode in first])),
+        "planners": {name: _figures(rows) for name, rows in planners.items()},
+        "against": {name: _against(ours, rows) for name, rows in others.items()},
+        "episodes": [{key: getattr(e, key) for key in keys} for e in episodes],
+    }
 
 
 def _figures(episodes: Sequence[PushTEpisode]) -> dict[str, Any]:
@@ -335,7 +290,7 @@ _ARM_M = 0.045  # the T's radius of gyration: what a rotation by 1 rad moves it 
 
 
 def tee_shape() -> ObjectShape:
-    """The T as two boxes."""
+    """Return the T as two boxes."""
     boxes = [np.array([[x, y, z] for x in xs for y in ys for z in (-1, 1)]) for xs, ys in (_BAR, _STEM)]
     scale, shift = (PX_M, PX_M, _HALF_HEIGHT_M), (*_MIDDLE_PX, 0.0)
     corners = [(box - shift) * scale for box in boxes]
@@ -345,34 +300,33 @@ def tee_shape() -> ObjectShape:
 
 
 def pose_of(tee: Float[np.ndarray, "*batch 3"]) -> Pose:
-    """The T's pose on the table from its origin [px] and angle [rad] on the plane."""
+    """Return the T's pose on the table, given its origin [px] and angle [rad] on the plane."""
     sine, cosine = np.sin(tee[..., 2]), np.cos(tee[..., 2])
     (x, y), height = _MIDDLE_PX, np.full(tee.shape[:-1], _HALF_HEIGHT_M)
-    middle = tee[..., :2] + np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
-    flat = _on_table(middle)
+    flat = _on_table(tee[..., :2] + np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1))
     turn = np.zeros((*tee.shape[:-1], 3))
     turn[..., 2] = tee[..., 2]
     return Pose(np.concatenate([flat, height[..., None]], axis=-1), quaternion_exp(turn))
 
 
 def scene_of(state: Float[np.ndarray, "7"]) -> SceneState:
-    """The plane's state as a scene."""
+    """Return the plane's state as a scene."""
     return SceneState((NAME,), pose_of(state[None, 4:]), Light(np.array([0.0, 0.0, 1.0])), _pusher(state[:2]))
 
 
 def rollouts_of(states: Float[np.ndarray, "K T1 7"]) -> Rollouts:
-    """Sequences of the plane's states as futures of the scene."""
+    """Return sequences of the plane's states as futures of the scene."""
     poses = pose_of(states[:, :, None, 4:])
     return Rollouts((NAME,), poses.position, poses.quaternion, _pusher(states[..., :2]))
 
 
 def goal_of(tee: Float[np.ndarray, "3"]) -> PoseGoal:
-    """The pose goal of a place [px, rad] on the plane."""
+    """Return the pose goal of a place [px, rad] on the plane."""
     return PoseGoal((NAME,), pose_of(tee[None]))
 
 
 def cost_of(goal: PoseGoal) -> PoseCost:
-    """What futures cost, for all planners."""
+    """Return the cost of futures, the same for all planners."""
     return PoseCost(goal, _ARM_M)
 
 
@@ -398,7 +352,7 @@ PYTORCH_MPPI_LAMBDA = 0.001  # of the cost [m]; the best of 0.0003 to 0.03 on th
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Problem:
-    """What a planner is given.
+    """A task as a planner gets it.
 
     Attributes:
         goal: where the T should be.
@@ -417,11 +371,7 @@ class Planner(Protocol):
     """Plans again before every action."""
 
     def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
-        """The next action [m/s].
-
-        Args:
-            state: of the plane.
-        """
+        """Return the next action in a state of the plane [m/s]."""
         ...
 
 
@@ -435,7 +385,7 @@ class OurPlanner:
         self._planner = MPPIPlanner(self._futures, PushProposals({NAME: tee_shape()}), settings)
 
     def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
-        """The next action [m/s]."""
+        """Return the next action [m/s]."""
         scene = self._futures.begin(state)
         *_, last = self._planner.plan(scene, self._goal, cost_of(self._goal), self._rng)
         self._planner.shift(1)
@@ -451,7 +401,7 @@ class PaperPlanner:
         self._planner = GaussianMPPI(self._futures, settings)
 
     def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
-        """The next action [m/s]."""
+        """Return the next action [m/s]."""
         actions = self._planner.plan(self._futures.begin(state), cost_of(self._goal), self._rng).actions
         self._planner.shift()
         return actions[0, :2]
@@ -463,22 +413,19 @@ class PytorchMPPI:
     It draws from torch's global generator, so `rng` is left alone.
 
     Raises:
-        MissingPushT: if it is not installed.
+        MissingExtra: if it is not installed.
     """
 
     def __init__(self, problem: Problem, rng: np.random.Generator) -> None:
-        import torch
+        need("pusht", "Push-T")
+        from pytorch_mppi import MPPI  # pyright: ignore[reportMissingImports]  an extra
 
-        try:
-            from pytorch_mppi import MPPI  # pyright: ignore[reportMissingImports]  an extra
-        except ImportError:
-            raise MissingPushT from None
         cost = cost_of(problem.goal)
 
         def dynamics(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
             return torch.from_numpy(problem.step(states.numpy(), actions.numpy()))
 
-        def cost_of_nothing(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        def no_cost(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
             return states.new_zeros(len(states))
 
         def cost_of_all(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
@@ -487,33 +434,33 @@ class PytorchMPPI:
 
         limit = torch.full((2,), MAX_SPEED_M_S, dtype=torch.float64)
         self._planner: Any = MPPI(
-            dynamics, cost_of_nothing, STATE, NOISE_M_S**2 * torch.eye(2, dtype=torch.float64),
+            dynamics, no_cost, STATE, NOISE_M_S**2 * torch.eye(2, dtype=torch.float64),
             num_samples=problem.samples, horizon=problem.horizon, terminal_state_cost=cost_of_all,
             lambda_=PYTORCH_MPPI_LAMBDA, u_min=-limit, u_max=limit,
             U_init=torch.zeros(problem.horizon, 2, dtype=torch.float64),
         )  # fmt: skip
 
     def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
-        """The next action [m/s]."""
+        """Return the next action [m/s]."""
         return self._planner.command(state).numpy().clip(-MAX_SPEED_M_S, MAX_SPEED_M_S)
 
 
-PLANNERS = {"ours": OurPlanner, "paper": PaperPlanner, "pytorch_mppi": PytorchMPPI}
+PLANNERS = {_OURS: OurPlanner, "paper": PaperPlanner, "pytorch_mppi": PytorchMPPI}
 
 
 class _Futures:
-    """Rolls out from one state of the plane, which tells more than a scene: the pusher's velocity."""
+    """Rolls out from one state of the plane, which holds more than a scene: the pusher's velocity."""
 
     def __init__(self, step: Step) -> None:
         self._step, self._now = step, np.zeros(STATE)
 
     def begin(self, state: Float[np.ndarray, "7"]) -> SceneState:
-        """Where futures begin from here on, as a scene."""
+        """Set where futures begin from here on, and return it as a scene."""
         self._now = state
         return scene_of(state)
 
     def __call__(self, state: SceneState, actions: Float[np.ndarray, "K T 3"], before: SceneState | None) -> Rollouts:
-        """Futures of K sequences."""
+        """Return the futures of K sequences."""
         states = [np.tile(self._now, (len(actions), 1))]
         for t in range(actions.shape[1]):
             states.append(self._step(states[-1], actions[:, t, :2]))
@@ -557,89 +504,56 @@ class BenchPlanner:
         check_seed(self.seed)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class BenchPlannerStep:
-    """How far the measurement is.
-
-    Attributes:
-        done: episodes finished.
-        total: episodes in all.
-        note: what is being done.
-        report: with the last step only.
-    """
-
-    done: int
-    total: int
-    note: str
-    report: PlannerReport | None = None
-
-
-def bench_planner(config: BenchPlanner) -> Iterator[BenchPlannerStep]:
-    """Let every planner do every task.
+def bench_planner(config: BenchPlanner) -> Iterator[EvaluationStep[dict[str, Any]]]:
+    """Let every planner do every task; the report is that of `report_json`.
 
     Args:
         config: what to measure, and how often.
 
     Raises:
-        MissingPushT: if the benchmark is not installed.
+        MissingExtra: if the benchmark is not installed.
     """
     total, episodes = config.tasks * len(PLANNERS), list[PushTEpisode]()
-    stage = _Stage(config)
-    yield BenchPlannerStep(0, total, "Warming up")
-    with torch_in_one_thread():
-        for name in PLANNERS:
-            stage.episode(name, 0, steps=1)
+    world, simulation = PushT(), Simulation()
+    yield EvaluationStep(0, total, "Warming up")
+    for name in PLANNERS:
+        _episode(config, name, 0, 1, world, simulation)
     for task in range(config.tasks):
         for name in PLANNERS:
-            yield BenchPlannerStep(len(episodes), total, f"Pushing (task {task + 1} of {config.tasks}, {name})")
-            with torch_in_one_thread():
-                episodes.append(stage.episode(name, task, config.steps))
-    yield BenchPlannerStep(total, total, "Everything is measured", PlannerReport(tuple(episodes)))
+            yield EvaluationStep(len(episodes), total, f"Pushing (task {task + 1} of {config.tasks}, {name})")
+            episodes.append(_episode(config, name, task, config.steps, world, simulation))
+    yield EvaluationStep(total, total, "Everything is measured", report_json(episodes))
 
 
-class _Stage:
-    """The environment, and the simulation that all planners share."""
+def _episode(
+    config: BenchPlanner, name: str, task: int, steps: int, world: PushT, simulation: Simulation
+) -> PushTEpisode:
+    """Let one planner do one task, with torch in one thread."""
+    world.reset(config.seed + task)
+    start = coverage = world.coverage()
+    states: list[Float[np.ndarray, "7"]] = []
 
-    def __init__(self, config: BenchPlanner) -> None:
-        self._config, self._world, self._simulation = config, PushT(), Simulation()
+    def planner(step: Step) -> Planner:
+        problem = Problem(goal_of(world.goal), step, config.samples, config.horizon)
+        return PLANNERS[name](problem, stream_rng(config.seed, Stream.BENCHMARK, task))
 
-    def episode(self, name: str, task: int, steps: int) -> PushTEpisode:
-        """One task by one planner."""
-        world, config = self._world, self._config
-        world.reset(config.seed + task)
-        start = coverage = world.coverage()
-        problem = Problem(goal_of(world.goal), self._simulation, config.samples, config.horizon)
-        clock = _Clock(PLANNERS[name](problem, stream_rng(config.seed, Stream.BENCHMARK, task)))
-        own = Problem(problem.goal, drift, config.samples, config.horizon)
-        states: list[Float[np.ndarray, "7"]] = []
-        with torch.random.fork_rng(devices=[]):  # one of the planners draws from torch's global generator
-            torch.manual_seed(stream_seed(config.seed, Stream.BENCHMARK, task))
-            while not states or (len(states) < steps and coverage <= world.success_coverage):
-                states.append(world.state)
-                coverage = max(coverage, world.act(clock.plan(states[-1])))
-            own_clock = _Clock(PLANNERS[name](own, stream_rng(config.seed, Stream.BENCHMARK, task)))
-            for state in states:
-                own_clock.plan(state)
-        is_success = coverage > world.success_coverage
-        return PushTEpisode(
-            name, config.seed + task, start, coverage, is_success, len(states), clock.seconds, own_clock.seconds
-        )
+    # One of the planners draws from torch's global generator.
+    with torch_in_one_thread(), torch.random.fork_rng(devices=[]):
+        one, plan_s = planner(simulation), list[float]()
+        torch.manual_seed(stream_seed(config.seed, Stream.BENCHMARK, task))
+        while not states or (len(states) < steps and coverage <= world.success_coverage):
+            states.append(world.state)
+            coverage = max(coverage, world.act(_timed_plan(one, states[-1], plan_s)))
+        one, own_s = planner(drift), list[float]()
+        for state in states:
+            _timed_plan(one, state, own_s)
+    is_success = coverage > world.success_coverage
+    return PushTEpisode(name, config.seed + task, start, coverage, is_success, len(states), plan_s, own_s)
 
 
-class _Clock:
-    """A planner that is timed."""
-
-    def __init__(self, planner: Planner) -> None:
-        self._planner, self._seconds = planner, list[float]()
-
-    @property
-    def seconds(self) -> tuple[float, ...]:
-        """How long each plan took [s]."""
-        return tuple(self._seconds)
-
-    def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
-        """The next action [m/s]."""
-        start = time.perf_counter()
-        action = self._planner.plan(state)
-        self._seconds.append(time.perf_counter() - start)
-        return action
+def _timed_plan(planner: Planner, state: Float[np.ndarray, "7"], seconds: list[float]) -> Float[np.ndarray, "2"]:
+    """Return the next action [m/s], and note how long the plan took."""
+    start = time.perf_counter()
+    action = planner.plan(state)
+    seconds.append(time.perf_counter() - start)
+    return action

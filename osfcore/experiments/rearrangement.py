@@ -1,4 +1,4 @@
-"""How well tables become what a goal image shows (paper, section 5.4 and figure 7).
+"""Measure how well tables become what a goal image shows (paper, section 5.4 and figure 7).
 
 The loop sees four cameras, masks in the first frame, and the goal image; it has 30 actions, or as many as are asked
 for. The same tasks are given to the same planner with true poses, whose best of several tries counts (an oracle: an
@@ -15,7 +15,6 @@ from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ from osfcore.control.events import (
 )
 from osfcore.dynamics.graph import read_network
 from osfcore.dynamics.rollout import PushModel, network_path, shipped
-from osfcore.errors import InvalidInput, MissingAssets, check_ranges, check_seed
+from osfcore.errors import InvalidInput
 from osfcore.experiments.dynamics_scores import MOVED_DEG, MOVED_MM
 from osfcore.experiments.factors import UNSEEN_NETWORK, Factor, factor_named
 from osfcore.experiments.harness import (
@@ -43,11 +42,13 @@ from osfcore.experiments.harness import (
     Piece,
     TaskCache,
     TaskResult,
+    check_run,
+    chosen_objects,
     file_sha256,
     finished,
     table_sha256,
 )
-from osfcore.experiments.images import field_path, known_names
+from osfcore.experiments.methods import field_path, known_names
 from osfcore.experiments.rearrangement_report import MpcReport, write_pictures
 from osfcore.experiments.rearrangement_runs import (
     Ended,
@@ -101,7 +102,7 @@ class Course:
 
 
 def prediction_errors(course: Course, models: SceneModels) -> dict[str, list[float]]:
-    """Errors four actions ahead of all objects that truly moved by over 1 cm or 5 deg meanwhile.
+    """Return errors four actions ahead of all objects that truly moved by over 1 cm or 5 deg meanwhile.
 
     Args:
         course: of the episode.
@@ -110,7 +111,7 @@ def prediction_errors(course: Course, models: SceneModels) -> dict[str, list[flo
     Returns:
         "mm" and "deg", symmetries considered, one entry for each object and start.
     """
-    told: dict[str, list[float]] = {"mm": [], "deg": []}
+    errors: dict[str, list[float]] = {"mm": [], "deg": []}
     for start, state in sorted(course.estimated.items()):
         numbers = range(start + 1, start + AHEAD + 1)
         if start + AHEAD not in course.true or any(number not in course.actions for number in numbers):
@@ -119,25 +120,22 @@ def prediction_errors(course: Course, models: SceneModels) -> dict[str, list[flo
         rollouts = models.dynamics.rollout(state, actions[None], course.estimated.get(start - 1))
         before, after = course.true[start], course.true[start + AHEAD]
         for n, name in enumerate(rollouts.names):
-            way = _apart(models.symmetries, name, before.pose(name), after.pose(name))
-            if way[0] > MOVED_MM or way[1] > MOVED_DEG:
+            way_mm, way_deg = _apart(models.symmetries[name], before.pose(name), after.pose(name))
+            if way_mm > MOVED_MM or way_deg > MOVED_DEG:
                 predicted = Pose(rollouts.positions[0, AHEAD, n], rollouts.quaternions[0, AHEAD, n])
-                mm, deg = _apart(models.symmetries, name, predicted, after.pose(name))
-                told["mm"].append(round(mm, 3))
-                told["deg"].append(round(deg, 3))
-    return told
+                mm, deg = _apart(models.symmetries[name], predicted, after.pose(name))
+                errors["mm"].append(round(mm, 3))
+                errors["deg"].append(round(deg, 3))
+    return errors
 
 
-def _apart(symmetries: Mapping[str, Symmetry], name: str, one: Pose, other: Pose) -> tuple[float, float]:
-    """Distance [mm] and angle [deg] between two poses of an object."""
+def _apart(symmetry: Symmetry, one: Pose, other: Pose) -> tuple[float, float]:
+    """Return distance [mm] and angle [deg] between two poses of an object."""
     mm = 1000 * float(np.linalg.norm(one.position - other.position))
-    return mm, float(np.rad2deg(rotation_error(symmetries[name], one.quaternion, other.quaternion)))
+    return mm, float(np.rad2deg(rotation_error(symmetry, one.quaternion, other.quaternion)))
 
 
-# Single episodes, measured: those of methods that see images, and of the planner that is told the truth.
-
-
-_NO_ERRORS: Mapping[str, list[float]] = MappingProxyType({"mm": [], "deg": []})  # of who predicts no poses
+# Single episodes, measured: those of methods that see images, and of the planner that knows the truth.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -149,7 +147,7 @@ class MeasuredEpisodes:
         fields: of their objects.
         assets: meshes for the simulator.
         data_dir: where networks trained on this machine are.
-        factor: name of what differs from the usual world; "" for nothing.
+        factor: what differs from the usual world.
         variant: whose episodes.
     """
 
@@ -157,38 +155,37 @@ class MeasuredEpisodes:
     fields: FieldLibrary
     assets: AssetLibrary
     data_dir: Path
-    factor: str = ""
-    variant: Variant = field(default_factory=Variant)
+    factor: Factor
+    variant: Variant
 
-    def from_images(
-        self, number: int, settings: EpisodeSettings, published: GaussianPlanSettings | None = None
-    ) -> TaskResult:
-        """A task for a method that sees images alone; doubts about its goal are noted and overruled."""
+    def from_images(self, number: int, settings: EpisodeSettings, published: GaussianPlanSettings) -> TaskResult:
+        """Run a task with a method that sees images alone; doubts about its goal are noted and overruled."""
         drawn = self._drawn(number)
         models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
-        if self._factor().has_unseen_objects:
+        if self.factor.has_unseen_objects:
             models = replace(models, dynamics=PushModel(read_network(shipped(UNSEEN_NETWORK)), models.shapes))
-        parts = loop_parts(self.variant, models, drawn.task, self.fields, self.data_dir)
+        lights = drawn.task.start.light, drawn.task.goal.light
+        parts = loop_parts(self.variant, models, self.fields, self.data_dir, lights)
         settings, rng = replace(settings, despite_doubts=True), stream_rng(self.tasks.seed, Stream.EPISODE, number)
         log = _Log(drawn.task, models.symmetries)
-        given = drawn.task, self.assets, parts, settings, rng, self._factor(), self.variant, published
+        given = drawn.task, self.assets, parts, settings, rng, self.factor, self.variant, published
         ended = log.follow(run_from_images(*given))
         return self._scored(drawn, ended, {**log.summary(), "predicted": prediction_errors(log.course, parts.models)})
 
     def by_foresight(self, number: int, settings: ForesightSettings, actions: int) -> TaskResult:
-        """A task for visual foresight, which pushes until all actions are done."""
+        """Run a task with visual foresight, which pushes until all actions are done and predicts no poses."""
         drawn = self._drawn(number)
         rng = stream_rng(self.tasks.seed, Stream.EPISODE, number)
         log, predictor = _Log(drawn.task, {}), read_fitvid(fitvid_path(self.data_dir), torch.bfloat16)
-        given = drawn.task, self.assets, predictor, settings, actions, rng, self._factor(), predictor.settings.side
+        given = drawn.task, self.assets, predictor, settings, actions, rng, self.factor, predictor.settings.side
         ended = log.follow(run_visual_foresight(*given))
-        return self._scored(drawn, ended, {**log.summary(), "predicted": dict(_NO_ERRORS)})
+        return self._scored(drawn, ended, {**log.summary(), "predicted": {"mm": [], "deg": []}})
 
     def oracle(self, number: int, settings: EpisodeSettings, tries: int) -> TaskResult:
-        """The best of several tries of the planner at a task with true poses; the simulator can be set back.
+        """Run the planner with true poses several times, and return the best; the simulator can be set back.
 
-        They end with the first that succeeds. The last has the simulator as its dynamics, which takes far longer than
-        the learned model, and plans before every second action.
+        Tries end with the first that succeeds. The last one has the simulator as its dynamics, which takes far longer
+        than the learned model, and plans before every second action.
         """
         drawn = self._drawn(number)
         models = load_scene_models(drawn.task.start.names, self.fields, self.assets, self.data_dir)
@@ -201,31 +198,23 @@ class MeasuredEpisodes:
             ends.append((self._score(drawn.task, end.state), end))
             if ends[-1][0].is_tight():
                 break
-        _, best = max(ends, key=lambda tried: _quality(tried[0]))
+        _, best = max(ends, key=lambda one: (one[0].is_tight(), one[0].is_success(), -one[0].pose6d_symmetric))
         return self._scored(drawn, best, {"tries": len(ends)})
 
     def _drawn(self, number: int) -> DrawnTask:
         drawn = draw_task(self.assets, self.tasks, number)
-        task = self._factor().task(drawn.task, stream_rng(self.tasks.seed, Stream.FACTOR_LIGHT, number))
+        task = self.factor.task(drawn.task, stream_rng(self.tasks.seed, Stream.FACTOR_LIGHT, number))
         return replace(drawn, task=task)
-
-    def _factor(self) -> Factor:
-        return factor_named(self.factor) if self.factor else Factor()
 
     def _scored(self, drawn: DrawnTask, ended: Ended, figures: dict[str, Any]) -> TaskResult:
         task = drawn.task
         score, nothing = (self._score(task, state) for state in (ended.state, task.start))
-        told = {"score": score.to_json(), "noaction": nothing.to_json(), "rejected": dict(drawn.rejected), **figures}
+        scores = {"score": score.to_json(), "noaction": nothing.to_json(), "rejected": dict(drawn.rejected)}
         label = f"{task.number}: {score.moved_mm:.0f} mm"
-        return TaskResult(told, (Comparison(label, to_uint8(ended.goal), to_uint8(ended.image)),))
+        return TaskResult({**scores, **figures}, (Comparison(label, to_uint8(ended.goal), to_uint8(ended.image)),))
 
     def _score(self, task: RearrangementTask, state: SceneState) -> RearrangementScore:
         return score_of(task, state, {name: self.assets.info(name).symmetry for name in task.start.names})
-
-
-def _quality(score: RearrangementScore) -> tuple[bool, bool, float]:
-    """What makes one end better than another."""
-    return score.is_tight(), score.is_success(), -score.pose6d_symmetric
 
 
 class _Log:
@@ -240,14 +229,14 @@ class _Log:
         self._truth: SceneState | None = None
 
     def follow(self, events: Iterator[Event | TrueState | Foreseen | Ended]) -> Ended:
-        """Take note of all events of an episode; how it ended is the last of them."""
+        """Take note of all events of an episode; the last of them, how it ended, is returned."""
         began, ended = time.perf_counter(), None
         for event in events:
             if isinstance(event, Ended):
                 ended = event
             else:
                 self.take(event)
-        assert ended is not None, "the last event tells how it ended"
+        assert ended is not None  # for the type checker
         self.figures["episode_s"] = round(time.perf_counter() - began, 2)
         return ended
 
@@ -285,7 +274,7 @@ class _Log:
         self.figures |= {"outcome": outcome, "steps": steps, "robot_s": round(STEP_S * steps, 3)}
 
     def _first_errors(self, state: SceneState) -> dict[str, float]:
-        """Of the first estimate: means over all objects [mm, deg], and the angle of the light [deg]."""
+        """Return errors of the first estimate: means over all objects [mm, deg], and the angle of the light [deg]."""
         start = self._task.start
         score = score_of(replace(self._task, goal=start), state, self._symmetries)
         return {
@@ -295,16 +284,15 @@ class _Log:
         }
 
     def summary(self) -> dict[str, Any]:
-        """All figures."""
+        """Return all figures, with the median time of each stage [s]."""
         seconds = {}
         for stage in ("first", "goal", "estimate", "plan"):
-            told = self._seconds.get(stage)
-            seconds[f"{stage}_s"] = round(float(np.median(told)), 3) if told else None
+            times = self._seconds.get(stage)
+            seconds[f"{stage}_s"] = round(float(np.median(times)), 3) if times else None
         return {**self.figures, **seconds}
 
 
 REPORT_FILE = "mpc.json"
-MAX_TASKS = 10_000
 MAX_TRIES = 1000
 ORACLE_PLAN = PlanSettings(samples=192)
 _ORACLE_REACHED_RAD = 0.05  # half of what counts as success: ours stops earlier
@@ -312,7 +300,6 @@ _ORACLE_REACHED_RAD = 0.05  # half of what counts as success: ours stops earlier
 VERSION = 1  # raised by hand when figures may change
 
 Plan = PlanSettings | GaussianPlanSettings | ForesightSettings
-_Work = Callable[[int], TaskResult]
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,7 +318,7 @@ class EvaluateMpc:
         factor: name of what differs from the usual world; "" for nothing.
         cost: what futures are compared by.
         names: objects to draw from; all that have a field and a mesh if None.
-        oracle: also run the planner that is told the truth.
+        oracle: also run the planner that knows the truth.
         oracle_tries: that it has at each task.
         settings: of the episodes but for their cost and number of actions.
         oracle_plan: how the oracle plans.
@@ -364,10 +351,20 @@ class EvaluateMpc:
             return self.foresight
         return self.published if self.variant.published("planning") else self.settings.plan
 
+    @property
+    def world(self) -> Factor:
+        """How the world differs from the usual one."""
+        return factor_named(self.factor) if self.factor else Factor()
+
+    @property
+    def task_set(self) -> TaskSet:
+        """The tasks, as they are drawn."""
+        return TaskSet(self.names or (), self.family, self.objects, self.seed)
+
 
 def evaluate_mpc(
     config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[EvaluationStep]:
+) -> Iterator[EvaluationStep[dict[str, Any]]]:
     """Run all tasks; pictures and mpc.json go to `config.folder`.
 
     Args:
@@ -383,7 +380,7 @@ def evaluate_mpc(
         WorkerDied: if a worker process ended.
         CorruptFile, CannotWrite: as files are.
     """
-    config = replace(config, names=_checked(config, fields, assets))
+    config = checked(config, fields, assets)
     pieces = episode_pieces(config, fields, assets)
     results = yield from finished(pieces, executor, "episodes")
     report = episodes_report(config, results)
@@ -394,13 +391,13 @@ def evaluate_mpc(
 
 
 def episodes_report(config: EvaluateMpc, results: Sequence[TaskResult]) -> MpcReport:
-    """What the results of `episode_pieces` tell, in their order."""
+    """Return the report on results of `episode_pieces`, given in their order."""
     is_ours = config.variant.method == "ours"
     return MpcReport(tuple(results[: config.tasks]), tuple(results[config.tasks :]), may_refuse=is_ours)
 
 
 def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
-    """The figures of a report with what was measured, as plain JSON."""
+    """Return the figures of a report with what was measured, as plain JSON."""
     about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor")}
     variant = config.variant
     about["cost"] = "image" if variant.method == "foresight" or variant.published("planning") else config.cost
@@ -410,85 +407,76 @@ def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
     return {**report.to_json(), **about}
 
 
-def _checked(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    check_ranges(
-        ("number of tasks", config.tasks, 1, MAX_TASKS),
-        ("number of the oracle's tries", config.oracle_tries, 1, MAX_TRIES),
-    )
-    check_variant(config.variant)
-    if config.factor and factor_named(config.factor).has_unseen_objects and config.variant.published("dynamics"):
-        allowed = "left out with the paper's dynamics: they are of objects that have a name"
-        raise InvalidInput("factor of variation", config.factor, allowed)
-    check_seed(config.seed)
-    if config.names is None:
-        known = known_names(config.variant.fields, fields, config.data_dir)
-        names = tuple(name for name in known if fields.has(name) and assets.has(name))
-    else:
-        names = tuple(dict.fromkeys(config.names))
-        for name in names:
-            fields.info(name)
-            if not assets.has(name):
-                raise MissingAssets([name])
-            field_path(config.variant.fields, name, fields, config.data_dir)
-    check_tasks(_tasks(replace(config, names=names)))
-    return names
-
-
-def _tasks(config: EvaluateMpc) -> TaskSet:
-    return TaskSet(config.names or (), config.family, config.objects, config.seed)
-
-
-def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> list[Piece]:
-    """The method's episodes, then the oracle's, after everything asked for was found possible.
-
-    Args:
-        config: what to measure.
-        fields: of the objects.
-        assets: meshes for the simulator.
+def checked(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> EvaluateMpc:
+    """Check that everything asked for is possible, and fill in the objects to draw from.
 
     Raises:
         UnknownName, MissingAssets, InvalidInput, NoRoom: as `evaluate_mpc` does.
     """
-    config = replace(config, names=_checked(config, fields, assets))
+    check_run(config.tasks, config.seed, ("number of the oracle's tries", config.oracle_tries, 1, MAX_TRIES))
+    check_variant(config.variant)
+    if config.world.has_unseen_objects and config.variant.published("dynamics"):
+        allowed = "left out with the paper's dynamics: they are of objects that have a name"
+        raise InvalidInput("factor of variation", config.factor, allowed)
+    if config.names is None:
+        known = known_names(config.variant.fields, fields, config.data_dir)
+        names = tuple(name for name in known if fields.has(name) and assets.has(name))
+    else:
+        names = chosen_objects(config.names, fields, assets)
+        for name in names:
+            field_path(config.variant.fields, name, fields, config.data_dir)
+    config = replace(config, names=names)
+    check_tasks(config.task_set)
+    return config
+
+
+def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> list[Piece]:
+    """Return the method's episodes, then the oracle's.
+
+    Args:
+        config: what to measure, checked.
+        fields: of the objects.
+        assets: meshes for the simulator.
+    """
     settings = replace(config.settings, cost=config.cost, steps=config.actions, renewed=False)
-    told_truth = replace(
-        config.settings, steps=config.actions, plan=config.oracle_plan, reached_rad=_ORACLE_REACHED_RAD, renewed=False
-    )
-    episodes = MeasuredEpisodes(_tasks(config), fields, assets, config.data_dir, config.factor, config.variant)
-    given, own = _circumstances(config, fields, assets)
-    folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
-    usual = type(config.plan)()
-    parts = (config.variant.name(), config.cost, _plan_name(config.plan, usual), config.factor)
-    method = "-".join(part for part in parts if part)
-    kinds: list[tuple[str, dict[str, Any], _Work]]
+    episodes = MeasuredEpisodes(config.task_set, fields, assets, config.data_dir, config.world, config.variant)
+    common, own = _circumstances(config, fields, assets)
+    work: Callable[..., TaskResult]
     if config.variant.method == "foresight":
-        work: _Work = partial(episodes.by_foresight, settings=config.foresight, actions=settings.steps)
+        work = partial(episodes.by_foresight, settings=config.foresight, actions=settings.steps)
     else:
         work = partial(episodes.from_images, settings=settings, published=config.published)
-    kinds = [(method, {**own, "settings": asdict(settings), "plan": asdict(config.plan)}, work)]
+    plan = _plan_name(config.plan, type(config.plan)())
+    name = "-".join(part for part in (config.variant.name(), config.cost, plan, config.factor) if part)
+    kinds = {name: (work, {**own, "settings": asdict(settings), "plan": asdict(config.plan)})}
     if config.oracle:
-        told = "-".join(part for part in ("oracle", _plan_name(config.oracle_plan, ORACLE_PLAN)) if part)
+        settings = replace(
+            config.settings, steps=config.actions, plan=config.oracle_plan, reached_rad=_ORACLE_REACHED_RAD,
+            renewed=False,
+        )  # fmt: skip
         tries = config.oracle_tries
-        work = partial(episodes.oracle, settings=told_truth, tries=tries)
-        kinds.append((told, {"settings": asdict(told_truth), "tries": tries}, work))
+        name = "-".join(part for part in ("oracle", _plan_name(config.oracle_plan, ORACLE_PLAN)) if part)
+        work = partial(episodes.oracle, settings=settings, tries=tries)
+        kinds[name] = work, {"settings": asdict(settings), "tries": tries}
+    folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
     return [
-        Piece(f"{n:04d}", TaskCache(folder / kind), {**given, **circumstances}, partial(work, n))
-        for kind, circumstances, work in kinds
+        Piece(f"{n:04d}", TaskCache(folder / kind), {**common, **circumstances}, partial(work, n))
+        for kind, (work, circumstances) in kinds.items()
         for n in range(config.tasks)
     ]
 
 
 def _plan_name(plan: Plan, usual: Plan) -> str:
-    """What tells results of unusual plans from others."""
+    """Return what marks results of unusual plans."""
     return "" if plan == usual else f"K{plan.samples}T{plan.horizon}"
 
 
 def _circumstances(
     config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What all results depend on, and what those of the method do besides."""
+    """Return what all results depend on, and what those of the method depend on besides."""
     names = config.names or ()
-    given = {
+    common = {
         "names": {name: [file_sha256(fields.info(name).path), assets.digest(name)] for name in names},
         "network": file_sha256(network_path(config.data_dir)),
         "table": table_sha256(fields.load_table()),
@@ -502,6 +490,6 @@ def _circumstances(
         own["own_network"] = file_sha256(weights_path(config.data_dir))
     if config.variant.method == "foresight":
         own["own_network"] = file_sha256(fitvid_path(config.data_dir))
-    if config.factor and factor_named(config.factor).has_unseen_objects:
+    if config.world.has_unseen_objects:
         own["own_network"] = file_sha256(shipped(UNSEEN_NETWORK))
-    return given, own
+    return common, own

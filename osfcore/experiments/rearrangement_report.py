@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from osfcore.experiments.charts import Axis, Chart, cumulative, write_charts
-from osfcore.experiments.harness import TaskResult, compare_means, compare_shares, mean_interval, share_interval
+from osfcore.experiments.harness import TaskResult
+from osfcore.experiments.statistics import compare_means, compare_shares, mean, mean_interval, median, share_interval
 from osfcore.inspection.contact_sheet import contact_sheet
 from osfcore.io.image_file import write_png
 from osfcore.io.json_codec import decode
@@ -22,7 +23,9 @@ _LOOSE_DEG = 15.0
 _NEVER_MM = 1e6  # the error of a task in which something else was pushed away
 _CHART_MM, _CHART_6D = 60.0, 0.6
 _PER_ROW = 10
-_TESTS: dict[str, Callable[[RearrangementScore], bool]] = {
+_DISTANCES = ("pose6d", "pose6d_symmetric")
+_Test = Callable[[RearrangementScore], bool]
+_TESTS: dict[str, _Test] = {
     "success_tight": RearrangementScore.is_tight,
     "success_2cm": RearrangementScore.is_success,
     "success_2cm_15deg": lambda score: score.is_success(SUCCESS_M, _LOOSE_DEG),
@@ -34,8 +37,8 @@ class MpcReport:
     """Results of all tasks, in their order.
 
     Attributes:
-        ours: from images.
-        oracle: told the truth.
+        ours: of the method, which sees images.
+        oracle: of the planner that knows the truth.
         may_refuse: whether nothing is moved where the goal is doubted, as ours ships; a doubt of our loop about what
             another method's fields show counts for nothing.
     """
@@ -68,28 +71,27 @@ class MpcReport:
         return scores_of(self.oracle, "score")
 
     def to_json(self) -> dict[str, Any]:
-        """All figures; lengths in mm, angles in degrees, shares in [0, 1]."""
+        """Return all figures; lengths in mm, angles in degrees, shares in [0, 1]."""
         scores, nothing = self.shipped, self.nothing
         final = [score.moved_mm for score in scores]
-        is_curve = {str(mm): _mean([score.is_success(mm / 1000) for score in scores]) for mm in CURVE_MM}
         return {
             "tasks": len(scores),
             **_figures(scores, ""),
             **_figures(self.told_truth, "oracle_"),
             **_figures(nothing, "noaction_"),
-            **{f"{key}_overruled": _mean([test(s) for s in self.overruled]) for key, test in _TESTS.items()},
+            **{f"{key}_overruled": _share(self.overruled, test) for key, test in _TESTS.items()},
             "refused": sum(bool(result.figures["goal_doubt"]) for result in self.ours),
-            "success_by_moved": self._by_moved("success_2cm"),
-            "success_tight_by_moved": self._by_moved("success_tight"),
-            "success_curve": is_curve,
-            "final_mm_mean": _rounded(np.mean(final), 2),
-            "final_mm_median": _rounded(np.median(final), 2),
-            "final_deg_median": _rounded(np.median([score.moved_deg for score in scores]), 2),
-            "start_mm_mean": _rounded(np.mean([score.moved_mm for score in nothing]), 1),
+            "success_by_moved": self._by_moved(_TESTS["success_2cm"]),
+            "success_tight_by_moved": self._by_moved(_TESTS["success_tight"]),
+            "success_curve": {str(mm): _share(scores, lambda s, mm=mm: s.is_success(mm / 1000)) for mm in CURVE_MM},
+            "final_mm_mean": _rounded(mean(final), 2),
+            "final_mm_median": _rounded(median(final), 2),
+            "final_deg_median": _rounded(median(score.moved_deg for score in scores), 2),
+            "start_mm_mean": _rounded(mean(score.moved_mm for score in nothing), 1),
             "oracle_success_tight_by_try": self._by_try() if self.oracle else None,
-            "oracle_final_mm_mean": _mean_of([score.moved_mm for score in self.told_truth]),
+            "oracle_final_mm_mean": _rounded(mean(score.moved_mm for score in self.told_truth), 2),
             "seconds_robot_median": self._robot_s(),
-            **{f"{told}_s_median": self._median(f"{key}_s") for told, key in _STAGES.items()},
+            **{f"{name}_s_median": self._median(f"{key}_s") for name, key in _STAGES.items()},
             "steps_median": self._median("steps"),
             **self._own_pushes(),
             **{f"{key}_median": self._median(key) for key in ("goal_mm", "first_mm", "first_deg", "light_deg")},
@@ -99,79 +101,70 @@ class MpcReport:
             "rejected_layouts": self._rejected(),
         }
 
-    def _by_try(self) -> list[float]:
-        """The oracle's share of tight successes after one try, after two, and so on: whether more still help."""
-        pairs = [
-            (score.is_tight(), one.figures["tries"]) for score, one in zip(self.told_truth, self.oracle, strict=True)
-        ]
-        most = max(tries for _, tries in pairs)
-        return [_mean([is_tight and tries <= count for is_tight, tries in pairs]) for count in range(1, most + 1)]
+    def _by_try(self) -> list[float | None]:
+        """Return the oracle's share of tight successes after one try, after two, and so on: whether more still help."""
+        pairs = zip(self.told_truth, self.oracle, strict=True)
+        needed = [one.figures["tries"] if score.is_tight() else np.inf for score, one in pairs]
+        most = max(one.figures["tries"] for one in self.oracle)
+        return [_rounded(mean(tries <= count for tries in needed), 4) for count in range(1, most + 1)]
 
-    def _by_moved(self, key: str) -> dict[str, float]:
+    def _by_moved(self, test: _Test) -> dict[str, float | None]:
         counts = sorted({len(score.moved) for score in self.shipped})
-        test = _TESTS[key]
-        return {
-            str(count): _mean([test(score) for score in self.shipped if len(score.moved) == count]) for count in counts
-        }
+        return {str(n): _share([score for score in self.shipped if len(score.moved) == n], test) for n in counts}
 
     def _robot_s(self) -> float | None:
-        """Until the loop ended, over tasks within 2 cm."""
+        """Return the median time until the loop ended, over tasks within 2 cm [s]."""
         pairs = zip(self.ours, self.shipped, strict=True)
-        seconds = [result.figures["robot_s"] for result, score in pairs if score.is_success()]
-        return _rounded(np.median(seconds), 2) if seconds else None
+        return _rounded(median(result.figures["robot_s"] for result, score in pairs if score.is_success()), 2)
 
     def _own_pushes(self) -> dict[str, float | int | None]:
-        """How well our own pushes were predicted four actions ahead, from estimated poses."""
-        told: dict[str, float | int | None] = {}
+        """Return how well our own pushes were predicted four actions ahead, from estimated poses."""
+        figures: dict[str, float | int | None] = {}
         for unit in ("mm", "deg"):
             values = [value for result in self.ours for value in result.figures["predicted"][unit]]
-            told[f"own_pushes_mean_{unit}_4"] = _rounded(np.mean(values), 2) if values else None
-            told[f"own_pushes_median_{unit}_4"] = _rounded(np.median(values), 2) if values else None
-            told["own_pushes"] = len(values)
-        return told
+            figures[f"own_pushes_mean_{unit}_4"] = _rounded(mean(values), 2)
+            figures[f"own_pushes_median_{unit}_4"] = _rounded(median(values), 2)
+            figures["own_pushes"] = len(values)
+        return figures
 
     def _rejected(self) -> dict[str, int]:
         reasons = sorted({reason for result in self.ours for reason in result.figures["rejected"]})
         return {reason: sum(one.figures["rejected"].get(reason, 0) for one in self.ours) for reason in reasons}
 
     def _median(self, key: str) -> float | None:
-        values = [result.figures[key] for result in self.ours if result.figures[key] is not None]
-        return _rounded(np.median(values), 3) if values else None
+        return _rounded(median(result.figures[key] for result in self.ours), 3)
 
 
 _STAGES = {"replan": "plan", "estimate": "estimate", "first": "first", "goal": "goal", "episode": "episode"}
 
 
 def _figures(scores: Sequence[RearrangementScore], who: str) -> dict[str, Any]:
-    """What is told of everybody alike; None of nobody."""
-    told: dict[str, Any] = {}
+    """Return the figures that the method, the oracle and doing nothing all have; None without scores."""
+    figures: dict[str, Any] = {}
     for key, test in _TESTS.items():
-        passed = [test(score) for score in scores]
-        told[who + key] = _mean(passed) if scores else None
-        limits = share_interval(sum(passed), len(scores)) if scores else None
-        told[f"{who}{key}_interval"] = None if limits is None else [round(end, 3) for end in limits]
-    for key in ("pose6d", "pose6d_symmetric"):
+        interval = share_interval(sum(test(score) for score in scores), len(scores)) if scores else None
+        figures[who + key] = _share(scores, test)
+        figures[f"{who}{key}_interval"] = _rounded_ends(interval, 3)
+    for key in _DISTANCES:
         values = [getattr(score, key) for score in scores]
-        told[f"{who}{key}_mean"] = _rounded(np.mean(values), 4) if scores else None
-        told[f"{who}{key}_median"] = _rounded(np.median(values), 4) if scores else None
-        limits = mean_interval(values) if scores else None
-        told[f"{who}{key}_mean_interval"] = None if limits is None else [_rounded(end, 4) for end in limits]
-    return told
+        figures[f"{who}{key}_mean"] = _rounded(mean(values), 4)
+        figures[f"{who}{key}_median"] = _rounded(median(values), 4)
+        figures[f"{who}{key}_mean_interval"] = _rounded_ends(mean_interval(values), 4)
+    return figures
 
 
 def paired(ours: Sequence[RearrangementScore], others: Sequence[RearrangementScore]) -> dict[str, Any]:
-    """Two methods compared task by task: differences with intervals, and McNemar's test of the shares."""
-    told: dict[str, Any] = {}
-    for key in ("success_tight", "success_2cm"):
-        test = _TESTS[key]
-        told[key] = compare_shares([test(score) for score in ours], [test(score) for score in others])
-    for key in ("pose6d", "pose6d_symmetric"):
-        told[key] = compare_means(*([getattr(score, key) for score in them] for them in (ours, others)))
-    return told
+    """Compare two methods task by task: differences with intervals, and McNemar's test of the shares."""
+    shares = {
+        key: [[_TESTS[key](s) for s in them] for them in (ours, others)] for key in ("success_tight", "success_2cm")
+    }
+    distances = {key: [[getattr(s, key) for s in them] for them in (ours, others)] for key in _DISTANCES}
+    compared = {key: compare_shares(*both) for key, both in shares.items()}
+    return {**compared, **{key: compare_means(*both) for key, both in distances.items()}}
 
 
-def _by_object(scores: Sequence[RearrangementScore]) -> dict[str, dict[str, float]]:
-    """Of each object, how it ended where it had to move."""
+def _by_object(scores: Sequence[RearrangementScore]) -> dict[str, dict[str, float | None]]:
+    """Return how each object ended where it had to move."""
     rows: dict[str, list[ObjectScore]] = {}
     for score in scores:
         for one in score.moved:
@@ -179,17 +172,17 @@ def _by_object(scores: Sequence[RearrangementScore]) -> dict[str, dict[str, floa
     return {
         name: {
             "moved": len(ends),
-            "tight": _mean([end.is_tight() for end in ends]),
-            "within_2cm": _mean([end.is_within(SUCCESS_M, np.inf) for end in ends]),
-            "mm_median": _rounded(np.median([end.mm for end in ends]), 2),
-            "deg_median": _rounded(np.median([end.deg for end in ends]), 2),
+            "tight": _rounded(mean(end.is_tight() for end in ends), 4),
+            "within_2cm": _rounded(mean(end.is_within(SUCCESS_M, np.inf) for end in ends), 4),
+            "mm_median": _rounded(median(end.mm for end in ends), 2),
+            "deg_median": _rounded(median(end.deg for end in ends), 2),
         }
         for name, ends in sorted(rows.items())
     }
 
 
 def scores_of(results: Sequence[TaskResult], key: str) -> list[RearrangementScore]:
-    """The scores among the figures of results."""
+    """Return the scores among the figures of results."""
     return [decode(RearrangementScore, result.figures[key], "score") for result in results]
 
 
@@ -212,17 +205,17 @@ def write_pictures(folder: Path, report: MpcReport) -> None:
 
 
 def _reached_mm(score: RearrangementScore) -> float:
-    """Of the object that is farthest from its goal."""
+    """Return the error of the object that is farthest from its goal [mm]."""
     return max(one.mm for one in score.moved) if score.others_mm <= 1000 * SUCCESS_M else _NEVER_MM
 
 
-def _mean(values: Sequence[bool]) -> float:
-    return round(float(np.mean(values)), 4)
+def _share(scores: Sequence[RearrangementScore], test: _Test) -> float | None:
+    return _rounded(mean(test(score) for score in scores), 4)
 
 
-def _mean_of(values: Sequence[float]) -> float | None:
-    return _rounded(np.mean(values), 2) if values else None
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
 
 
-def _rounded(value: np.floating[Any] | float, digits: int) -> float:
-    return round(float(value), digits)
+def _rounded_ends(interval: Sequence[float] | None, digits: int) -> list[float] | None:
+    return None if interval is None else [round(end, digits) for end in interval]

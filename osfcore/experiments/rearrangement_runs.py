@@ -1,9 +1,9 @@
-"""One task of planning, done: by us from images, and by the same planner that is told the truth."""
+"""Do one task of rearrangement: from images, or by the same planner that knows the true poses."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -42,7 +42,7 @@ from osfcore.world.tabletop import Tabletop
 # Methods:
 #     ours         the loop as it ships.
 #     overhead     the same, but it takes the light to be overhead: what estimating the light is worth.
-#     known_light  the same, told the true lights of scene and goal image: what knowing them would be worth.
+#     known_light  the same with the true lights of scene and goal image: what knowing them would be worth.
 #     nerf         the same with fields that know of no light (compositional NeRFs).
 #     paper        the method as published; each of its stages can be replaced by ours.
 #     foresight    visual foresight with FitVid: neither objects nor poses nor light.
@@ -58,11 +58,12 @@ METHODS: tuple[Method, ...] = get_args(Method)
 TruthName = Literal["poses", "goal", "dynamics"]
 TRUTHS: tuple[TruthName, ...] = get_args(TruthName)
 _SURE = 1e-3  # claimed deviation of a true pose [m or rad]
+_OVERHEAD = Light(np.array([0.0, 0.0, 1.0]))
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """What is measured of a method, and what it sees.
+    """A method, what is replaced in it, and what it sees.
 
     Attributes:
         method: whose episodes.
@@ -80,15 +81,15 @@ class Variant:
 
     @property
     def fields(self) -> str:
-        """Whose fields it has: one of `image_methods.FIELD_METHODS`."""
+        """Whose fields it has: one of `methods.FIELD_METHODS`."""
         return "paper" if self.published("fields") else "nerf" if self.method == "nerf" else "ours"
 
     def published(self, stage: StageName) -> bool:
-        """Whether a stage is the paper's."""
+        """Return whether a stage is the paper's."""
         return self.method == "paper" and stage not in self.replaced
 
     def name(self) -> str:
-        """Of its files: the method, then what differs from it."""
+        """Return the name of its files: the method, then what differs from it."""
         views = f"{self.views}views" if self.views != Variant().views else ""
         true = (f"true_{truth}" for truth in sorted(self.truths))
         masks = "masks" if self.has_masks else ""
@@ -97,12 +98,7 @@ class Variant:
 
 @dataclass(frozen=True, slots=True)
 class LoopParts:
-    """What a closed loop is made of.
-
-    Attributes:
-        models: of the objects.
-        estimators: how everything is estimated.
-    """
+    """Models and estimators of a closed loop."""
 
     models: SceneModels
     estimators: Estimators
@@ -110,10 +106,10 @@ class LoopParts:
 
 @dataclass(frozen=True)
 class TrueEstimators(Estimators):
-    """Estimators that are told the truth of the scene, but not of the goal.
+    """Estimators that return the truth of the scene, but not of the goal.
 
     Attributes:
-        truth: tells the true state.
+        truth: returns the true state.
     """
 
     truth: Callable[[], SceneState] = field(kw_only=True)
@@ -121,7 +117,7 @@ class TrueEstimators(Estimators):
     def first_frame(
         self, models: ObjectModels, observation: Observation, rng: np.random.Generator
     ) -> Iterator[EstimateStep]:
-        """The truth."""
+        """Return the truth."""
         yield _true_step(self.truth())
 
     def later_frame(
@@ -132,7 +128,7 @@ class TrueEstimators(Estimators):
         rng: np.random.Generator,
         usual: Float[np.ndarray, "N"] | None = None,
     ) -> Iterator[EstimateStep]:
-        """The truth."""
+        """Return the truth."""
         yield _true_step(self.truth())
 
 
@@ -143,7 +139,7 @@ def _true_step(state: SceneState) -> EstimateStep:
 
 
 class SimulatedModel(SimulatedPushes):
-    """The simulator as a `DynamicsModel`.
+    """The simulator as a dynamics model.
 
     Args:
         assets: meshes.
@@ -158,10 +154,10 @@ class SimulatedModel(SimulatedPushes):
 
 
 def check_variant(variant: Variant) -> None:
-    """Refuse what cannot be combined.
+    """Check that everything in a variant can be combined.
 
     Raises:
-        InvalidInput: naming it.
+        InvalidInput: naming what cannot.
     """
     if variant.method not in METHODS:
         raise InvalidInput("method", repr(variant.method), f"one of {', '.join(METHODS)}")
@@ -170,20 +166,18 @@ def check_variant(variant: Variant) -> None:
         raise InvalidInput("stages of ours", "all of them", "some; method ours is what replaces all")
     _check_choice("stages replaced by the truth", variant.truths, TRUTHS, variant.method, "ours")
     if variant.has_masks and not (variant.published("estimation") and variant.published("planning")):
-        raise InvalidInput(
-            "masks at every step", "given", "left out: only the paper's estimation and planning use them"
-        )
+        allowed = "left out: only the paper's estimation and planning use them"
+        raise InvalidInput("masks at every step", "given", allowed)
     most = Variant().views
     if not 1 <= variant.views <= most:
         raise InvalidInput("number of views", variant.views, f"between 1 and {most}")
     if variant.views != most and variant.method == "foresight":
-        raise InvalidInput(
-            "number of views", variant.views, "left out with method foresight, which has the goal's view"
-        )
+        allowed = "left out with method foresight, which has the goal's view"
+        raise InvalidInput("number of views", variant.views, allowed)
 
 
-def _check_choice(what: str, chosen: Iterable[str], among: Iterable[str], method: str, needed: str) -> None:
-    chosen, among = sorted(chosen), tuple(among)
+def _check_choice(what: str, chosen: Iterable[str], among: Sequence[str], method: str, needed: str) -> None:
+    chosen = sorted(chosen)
     for one in chosen:
         if one not in among:
             raise InvalidInput(what, one, ", ".join(among))
@@ -192,30 +186,33 @@ def _check_choice(what: str, chosen: Iterable[str], among: Iterable[str], method
 
 
 def loop_parts(
-    variant: Variant, models: SceneModels, task: RearrangementTask, fields: FieldLibrary, data_dir: Path | None
+    variant: Variant,
+    models: SceneModels,
+    fields: FieldLibrary,
+    data_dir: Path | None,
+    lights: tuple[Light, Light] = (_OVERHEAD, _OVERHEAD),
 ) -> LoopParts:
-    """What a method's loop is made of; truths come to it when its world is there.
+    """Return the parts of a method's loop; truths come to them when its world is there.
 
     Args:
         variant: of any method but foresight.
         models: ours, of the task's objects.
-        task: of which a method is told the lights at most.
         fields: library of the fields.
         data_dir: whose files come before the installed ones.
+        lights: true ones of scene and goal image, for the method that knows them.
 
     Raises:
         UnknownName: if an object has no such field.
         CorruptFile: if a file is broken.
     """
-    overhead = Light(np.array([0.0, 0.0, 1.0]))
     match variant.method:
         case "overhead":
-            return LoopParts(models, Estimators.with_known_lights(overhead, overhead))
+            return LoopParts(models, Estimators.with_known_lights(_OVERHEAD, _OVERHEAD))
         case "known_light":
-            return LoopParts(models, Estimators.with_known_lights(task.start.light, task.goal.light))
+            return LoopParts(models, Estimators.with_known_lights(*lights))
         case "nerf":  # no light changes what its fields show, so none is looked for
-            given = Estimators.with_known_lights(overhead, overhead)
-            return LoopParts(with_nerfs(models, fields, data_dir), given)
+            estimators = Estimators.with_known_lights(_OVERHEAD, _OVERHEAD)
+            return LoopParts(with_nerfs(models, fields, data_dir), estimators)
         case "paper":
             stages = frozenset(STAGES) - variant.replaced
             estimators = PaperEstimators() if "estimation" in stages else Estimators()
@@ -224,32 +221,9 @@ def loop_parts(
             return LoopParts(models, Estimators())
 
 
-def told_truths(
-    parts: LoopParts, truths: frozenset[TruthName], truth: Callable[[], SceneState], assets: AssetLibrary
-) -> LoopParts:
-    """The same with stages replaced by the truth; the goal's is the caller's matter.
-
-    Args:
-        parts: of our loop.
-        truths: which.
-        truth: tells the true state.
-        assets: meshes for the simulator.
-    """
-    models, estimators = parts.models, parts.estimators
-    if "dynamics" in truths:
-        models = replace(models, dynamics=SimulatedModel(assets, tuple(models.shapes)))
-    if "poses" in truths:
-        estimators = TrueEstimators(estimators.first, estimators.later, estimators.goal, truth=truth)
-    return LoopParts(models, estimators)
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class TrueState:
-    """The truth at an instant that the loop has just estimated.
-
-    Attributes:
-        state: which the loop must not see.
-    """
+    """The true state, which the loop must not see, at an instant that the loop has just estimated."""
 
     state: SceneState
 
@@ -279,38 +253,39 @@ def run_from_images(
     variant: Variant | None = None,
     published: GaussianPlanSettings | None = None,
 ) -> Iterator[Event | TrueState | Ended]:
-    """The whole loop, with the truth before each `Stepped`; the last step is how it ended.
+    """Run the whole loop; yields the truth before each `Stepped`, and last how it ended.
 
     Args:
-        task: what is told of it is the goal image alone.
+        task: the method sees its goal image alone.
         assets: meshes, for the simulator.
-        parts: what the loop is made of.
-        settings: how the loop goes; of planning as published, the number of steps alone.
+        parts: of the loop.
+        settings: of the loop; planning as published uses the number of steps alone.
         rng: of estimates and plans.
         factor: how the world differs from what is taken for granted.
-        variant: tells who plans, what is replaced by the truth, and how many cameras there are.
+        variant: names who plans, what is replaced by the truth, and how many cameras there are.
         published: how planning as published samples.
     """
     variant = variant or Variant()
     cameras = default_cameras()[: variant.views]
-    world = VariedWorld(assets, factor or Factor(), rng.spawn(1)[0], cameras=cameras)
-    try:
+    with contextlib.closing(VariedWorld(assets, factor or Factor(), rng.spawn(1)[0], cameras=cameras)) as world:
         goal = world.goal_image(task.goal, goal_camera())
         world.restore(task.start)
-        parts = told_truths(parts, variant.truths, world.truth, assets)
+        models, estimators = parts.models, parts.estimators
+        if "dynamics" in variant.truths:
+            models = replace(models, dynamics=SimulatedModel(assets, tuple(models.shapes)))
+        if "poses" in variant.truths:
+            estimators = TrueEstimators(estimators.first, estimators.later, estimators.goal, truth=world.truth)
         if variant.published("planning"):
             how = AlgorithmSettings(settings.steps, published or GaussianPlanSettings(), variant.has_masks)
-            events = run_algorithm(world, parts.models, goal, how, parts.estimators, rng)
+            events = run_algorithm(world, models, goal, how, estimators, rng)
         else:
             target = PoseGoal(task.goal.names, task.goal.poses) if "goal" in variant.truths else goal
-            events = Episode(world, parts.models, target, settings, rng, parts=EpisodeParts(parts.estimators)).run()
+            events = Episode(world, models, target, settings, rng, parts=EpisodeParts(estimators)).run()
         for event in events:
             if isinstance(event, Stepped):
                 yield TrueState(world.truth())
             yield event
         yield _ended(world, goal)
-    finally:
-        world.close()
 
 
 def run_told_the_truth(
@@ -322,7 +297,7 @@ def run_told_the_truth(
     *,
     knows_pushes: bool,
 ) -> Ended:
-    """How the same planner leaves the table with true poses.
+    """Run the same planner with true poses.
 
     Args:
         task: with the true goal.
@@ -338,10 +313,12 @@ def run_told_the_truth(
         if knows_pushes:
             meshes = {name: assets.load(name) for name in task.start.names}
             rollout = stack.enter_context(contextlib.closing(SimulatedPushes(meshes))).rollout
-        image = _goal_image(world, task)
+        world.restore(task.goal)
+        camera = goal_camera()
+        goal = GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
         world.restore(task.start)
         _push_there(world, rollout, task, models, settings, rng)
-        return _ended(world, image)
+        return _ended(world, goal)
 
 
 def _push_there(
@@ -352,8 +329,9 @@ def _push_there(
     settings: EpisodeSettings,
     rng: np.random.Generator,
 ) -> None:
+    """Plan from true poses and push until the goal is reached or all steps are done."""
     planner = MPPIPlanner(rollout, PushProposals(models.shapes, models.pushes.rollout), settings.plan)
-    goal, number = _moved_goal(task), 0
+    goal, number = PoseGoal.of(task.start, {name: task.goal.pose(name) for name in task.moved}), 0
     while number < settings.steps:
         state = world.truth()
         goal = nearest_symmetric_goal(goal, state, models.symmetries)
@@ -369,16 +347,6 @@ def _push_there(
             world.act(action)
         planner.shift(len(actions))
         number += len(actions)
-
-
-def _moved_goal(task: RearrangementTask) -> PoseGoal:
-    return PoseGoal.of(task.start, {name: task.goal.pose(name) for name in task.moved})
-
-
-def _goal_image(world: Tabletop, task: RearrangementTask) -> GoalImage:
-    world.restore(task.goal)
-    camera = goal_camera()
-    return GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
 
 
 def _ended(world: Tabletop | VariedWorld, goal: GoalImage) -> Ended:

@@ -1,15 +1,15 @@
-"""How well futures are predicted as images: 30 steps of the goal camera's view (paper, section 5.3 and figure 6).
+"""Measure futures that are predicted as images: 30 steps of the goal camera's view (paper, section 5.3 and figure 6).
 
 Episodes of random pushes that nothing was trained on, each under a light from anywhere over the table. All methods know
-the actions and are given the same episodes, of objects that all of them know; `video_episodes` tells what each of them
-sees. Finished episodes are kept in the output folder, method by method: a killed comparison goes on where it was.
+the actions and are given the same episodes, of objects that all of them know. Finished episodes are kept in the output
+folder, method by method: a killed comparison goes on where it was.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,26 +19,18 @@ from jaxtyping import Float, UInt8
 
 from osfcore.control.estimators import Estimators, SceneModels, load_scene_models
 from osfcore.dynamics.rollout import network_path
-from osfcore.errors import InvalidInput, check_ranges, check_seed
+from osfcore.errors import InvalidInput
 from osfcore.experiments.charts import Axis
 from osfcore.experiments.estimation_tasks import episode, first_frame, take_frame
 from osfcore.experiments.fields import SCENE_QUALITY
-from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult, file_sha256, table_sha256
-from osfcore.experiments.images import (
-    TITLES,
-    check_methods,
-    common_names,
-    field_path,
-    measured,
-    summary,
-    tables_of,
-    write_comparison,
-)
+from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult, check_run, file_sha256
+from osfcore.experiments.images import measured, summary, tables_of, write_comparison
+from osfcore.experiments.methods import TITLES, check_methods, common_names, shown_circumstances
+from osfcore.experiments.rearrangement_runs import Variant, loop_parts
 from osfcore.experiments.rivals.fitvid import fitvid_path, read_fitvid
-from osfcore.experiments.rivals.nerf import with_nerfs
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, default_cameras, goal_camera, image_side
-from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, default_cameras, goal_camera
+from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
 from osfcore.geometry.rollouts import MAX_HORIZON
 from osfcore.geometry.states import Observation
 from osfcore.inspection.contact_sheet import Comparison, image_grid
@@ -46,7 +38,6 @@ from osfcore.io.image_file import to_uint8, write_png
 from osfcore.metrics.image_errors import psnr, ssim
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics import weights_path
-from osfcore.paper.stages import STAGES, PaperEstimators, with_paper_stages
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.types import SceneBatch
 from osfcore.world.tasks import Draw, draw_scene, opened
@@ -69,7 +60,7 @@ _SHOWN_STEPS = (1, 10, 20, 30)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class VideoEpisode:
-    """T actions that are known in advance, and what is seen.
+    """T actions that are known in advance, and images of what they do.
 
     Attributes:
         context: frames of the goal camera, one action before the look and at it.
@@ -87,7 +78,7 @@ class VideoEpisode:
 
 
 def simulate_video(draw: Draw, library: AssetLibrary, steps: int, size: int) -> VideoEpisode:
-    """Pushes that move some object by 5 cm or more, and one action before them.
+    """Simulate pushes that move some object by 5 cm or more, and one action before them.
 
     Args:
         draw: the scene that it begins with.
@@ -109,105 +100,8 @@ def simulate_video(draw: Draw, library: AssetLibrary, steps: int, size: int) -> 
     return VideoEpisode(np.stack(frames[:2]), pushes.actions[0], look, pushes.actions[1:], np.stack(frames[2:]))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class VideoEpisodes:
-    """Measures single episodes; can be sent to other processes.
-
-    Attributes:
-        fields: ours, and the table.
-        assets: meshes for the simulator.
-        data_dir: where networks and fields of other methods may be.
-        seed: of the estimates.
-        steps: actions that are predicted.
-        size: side of the frames [px].
-    """
-
-    fields: FieldLibrary
-    assets: AssetLibrary
-    data_dir: Path
-    seed: int
-    steps: int
-    size: int
-
-    def measure(self, number: int, draw: Draw, method: str) -> TaskResult:
-        """An episode as a method predicts it.
-
-        Args:
-            number: of the episode.
-            draw: the scene that it begins with.
-            method: one of `VIDEO_METHODS`.
-
-        Returns:
-            For each measure a figure for each step; comparisons after 1, 10, 20 and 30 actions.
-
-        Raises:
-            NoRoom: if the objects do not fit side by side.
-            UnknownName, CorruptFile: as fields and networks are.
-        """
-        video = simulate_video(draw, self.assets, self.steps, self.size)
-        predicted = self._predicted(number, video, method)
-        pairs = list(zip(video.frames, predicted, strict=True))
-        figures = {
-            "mse": [float(np.mean((true.astype(float) - image) ** 2)) for true, image in pairs],
-            "psnr": [psnr(true, image) for true, image in pairs],
-            "ssim": [ssim(true, image) for true, image in pairs],
-        }
-        shown = tuple(
-            Comparison(f"step {step}", *(to_uint8(image) for image in pairs[step - 1]))
-            for step in _SHOWN_STEPS
-            if step <= self.steps
-        )
-        return TaskResult(figures, shown)
-
-    def _predicted(self, number: int, video: VideoEpisode, method: str) -> Float[np.ndarray, "T h w 3"]:
-        match method:
-            case "copied":
-                return np.broadcast_to(video.context[1], video.frames.shape)
-            case "fitvid":
-                network = read_fitvid(fitvid_path(self.data_dir))
-                return network.predict(video.context, video.actions[None], between=video.between)[0]
-            case _:
-                models, estimators = self._models(method, video.look.names)
-                rng = stream_rng(self.seed, Stream.VIDEO_ESTIMATE, number)
-                return predict_through_fields(video, models, estimators, goal_camera(self.size), rng)
-
-    def _models(self, method: str, names: tuple[str, ...]) -> tuple[SceneModels, Estimators]:
-        models = load_scene_models(names, self.fields, self.assets, self.data_dir)
-        if method == "paper":
-            return with_paper_stages(models, frozenset(STAGES), self.fields, self.data_dir), PaperEstimators()
-        if method == "nerf":
-            overhead = Light(np.array([0.0, 0.0, 1.0]))
-            return with_nerfs(models, self.fields, self.data_dir), Estimators.with_known_lights(overhead, overhead)
-        return models, Estimators()
-
-
-def predict_through_fields(
-    video: VideoEpisode, models: SceneModels, estimators: Estimators, camera: Camera, rng: np.random.Generator
-) -> Float[np.ndarray, "T h w 3"]:
-    """Estimate what is seen, roll it out, render each step.
-
-    Args:
-        video: of which the look and the actions play a part.
-        models: fields and dynamics.
-        estimators: of poses and light.
-        camera: that sees the prediction.
-        rng: of the estimate.
-    """
-    *_, last = estimators.first_frame(models.appearance, video.look, rng)
-    assert last.estimate is not None, "the last step brings the estimate"
-    state = last.estimate.state
-    future = models.dynamics.rollout(state, video.actions[None])
-    lights = np.tile(state.light.direction, (len(video.actions), 1))
-    batch = SceneBatch(
-        future.names, future.positions[0, 1:], future.quaternions[0, 1:], lights, future.pusher[0, 1:]
-    )  # fmt: skip
-    rendered = models.appearance.together.render(batch, (camera,), quality=SCENE_QUALITY)
-    return np.clip(rendered.rgb[:, 0], 0, 1)
-
-
 REPORT_FILE, CHART_FILE, IMAGES_FILE = "video.json", "video.png", "video_episode.png"
-HORIZONS = (10, 30)  # steps over which means are told
-MAX_TASKS = 10_000
+HORIZONS = (10, 30)  # steps over which means are reported
 VERSION = 1  # raised by hand when figures may change
 
 
@@ -240,7 +134,7 @@ class CompareVideos:
 
 def compare_videos(
     config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[EvaluationStep]:
+) -> Iterator[EvaluationStep[dict[str, Any]]]:
     """Predict all episodes by all methods; the chart, images of the first episode and video.json go to `config.folder`.
 
     Args:
@@ -272,10 +166,8 @@ def compare_videos(
 
 
 def _checked(config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary) -> CompareVideos:
-    """The same with methods and names in order."""
-    check_ranges(("number of tasks", config.tasks, 1, MAX_TASKS), ("predicted steps", config.steps, 1, MAX_HORIZON))
-    check_seed(config.seed)
-    image_side(config.size)
+    """Check everything, and return the settings with methods and names in order."""
+    check_run(config.tasks, config.seed, ("predicted steps", config.steps, 1, MAX_HORIZON), size=config.size)
     methods = check_methods(config.methods, VIDEO_METHODS)
     names = common_names(methods, config.names, fields, assets, config.data_dir, config.objects)
     if "fitvid" in methods:
@@ -286,30 +178,25 @@ def _checked(config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary) 
 
 
 def _pieces(config: CompareVideos, method: str, fields: FieldLibrary, assets: AssetLibrary) -> list[Piece]:
-    episodes = VideoEpisodes(fields, assets, config.data_dir, config.seed, config.steps, config.size)
     given = {
         "steps": config.steps,
-        "size": config.size,
-        "quality": asdict(SCENE_QUALITY),
-        "table": table_sha256(fields.load_table()),
         "networks": [file_sha256(path) for path in _networks(method, config.data_dir)],
         "version": VERSION,
     }
     cache = TaskCache(config.folder / "video" / f"{config.objects}-{config.seed}" / method)
-
-    def piece(number: int) -> Piece:
-        stream = Stream.VIDEO_SCENE
-        draw = draw_scene(
-            config.names or (), config.objects, config.seed, number, stream, MIN_LIGHT_ELEVATION_DEG
-        )  # fmt: skip
-        own = _circumstances(draw, method, fields, assets, config.data_dir)
-        return Piece(f"{number:04d}", cache, {**given, **own}, partial(episodes.measure, number, draw, method))
-
-    return [piece(number) for number in range(config.tasks)]
+    pieces = []
+    for number in range(config.tasks):
+        names, stream = config.names or (), Stream.VIDEO_SCENE
+        draw = draw_scene(names, config.objects, config.seed, number, stream, MIN_LIGHT_ELEVATION_DEG)
+        # Shapes come from our fields in any case.
+        own = shown_circumstances(draw, ("ours", method), fields, assets, config.data_dir, config.size)
+        work = partial(measure_video, config, fields, assets, number, draw, method)
+        pieces.append(Piece(f"{number:04d}", cache, {**given, **own}, work))
+    return pieces
 
 
 def _networks(method: str, data_dir: Path) -> list[Path]:
-    """Networks that a method's predictions depend on."""
+    """Return the networks that a method's predictions depend on."""
     match method:
         case "copied":
             return []
@@ -321,21 +208,77 @@ def _networks(method: str, data_dir: Path) -> list[Path]:
             return [network_path(data_dir)]
 
 
-def _circumstances(
-    draw: Draw, method: str, fields: FieldLibrary, assets: AssetLibrary, data_dir: Path
-) -> dict[str, Any]:
-    """What an episode begins with, and by which fields it is shown; shapes come from ours in any case."""
-    paths = {name: (fields.info(name).path, field_path(method, name, fields, data_dir)) for name in draw.names}
-    digests = {name: [file_sha256(path) for path in pair] for name, pair in paths.items()}
-    return {
-        "objects": {name: [assets.digest(name), *told] for name, told in digests.items()},
-        "arrangement": draw.seed,
-        "light": draw.light.direction.tolist(),
+def measure_video(
+    config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary, number: int, draw: Draw, method: str
+) -> TaskResult:
+    """Measure an episode as a method predicts it.
+
+    Args:
+        config: with the number of steps and the size of the frames.
+        fields: ours, and the table.
+        assets: meshes for the simulator.
+        number: of the episode.
+        draw: the scene that it begins with.
+        method: one of `VIDEO_METHODS`.
+
+    Returns:
+        For each measure a figure for each step; comparisons after 1, 10, 20 and 30 actions.
+
+    Raises:
+        NoRoom: if the objects do not fit side by side.
+        UnknownName, CorruptFile: as fields and networks are.
+    """
+    video = simulate_video(draw, assets, config.steps, config.size)
+    match method:
+        case "copied":
+            predicted = np.broadcast_to(video.context[1], video.frames.shape)
+        case "fitvid":
+            network = read_fitvid(fitvid_path(config.data_dir))
+            predicted = network.predict(video.context, video.actions[None], between=video.between)[0]
+        case "ours" | "paper" | "nerf":
+            models = load_scene_models(video.look.names, fields, assets, config.data_dir)
+            parts = loop_parts(Variant(method), models, fields, config.data_dir)
+            rng = stream_rng(config.seed, Stream.VIDEO_ESTIMATE, number)
+            camera = goal_camera(config.size)
+            predicted = predict_through_fields(video, parts.models, parts.estimators, camera, rng)
+        case _:
+            raise InvalidInput("method", repr(method), f"one of {', '.join(VIDEO_METHODS)}")
+    pairs = list(zip(video.frames, predicted, strict=True))
+    figures = {
+        "mse": [float(np.mean((true.astype(float) - image) ** 2)) for true, image in pairs],
+        "psnr": [psnr(true, image) for true, image in pairs],
+        "ssim": [ssim(true, image) for true, image in pairs],
     }
+    steps = [step for step in _SHOWN_STEPS if step <= config.steps]
+    shown = [Comparison(f"step {step}", *(to_uint8(image) for image in pairs[step - 1])) for step in steps]
+    return TaskResult(figures, tuple(shown))
+
+
+def predict_through_fields(
+    video: VideoEpisode, models: SceneModels, estimators: Estimators, camera: Camera, rng: np.random.Generator
+) -> Float[np.ndarray, "T h w 3"]:
+    """Estimate what is seen, roll it out, render each step.
+
+    Args:
+        video: of which the look and the actions play a part.
+        models: fields and dynamics.
+        estimators: of poses and light.
+        camera: that sees the prediction.
+        rng: of the estimate.
+    """
+    *_, last = estimators.first_frame(models.appearance, video.look, rng)
+    assert last.estimate is not None  # for the type checker: the last step has the estimate
+    state = last.estimate.state
+    future = models.dynamics.rollout(state, video.actions[None])
+    lights = np.tile(state.light.direction, (len(video.actions), 1))
+    poses = future.positions[0, 1:], future.quaternions[0, 1:]
+    batch = SceneBatch(future.names, *poses, lights, future.pusher[0, 1:])
+    rendered = models.appearance.together.render(batch, (camera,), quality=SCENE_QUALITY)
+    return np.clip(rendered.rgb[:, 0], 0, 1)
 
 
 def _first_episode(results: Mapping[str, Sequence[TaskResult]]) -> UInt8[np.ndarray, "H W 3"]:
-    """The first episode: a row for the truth and for each method; some of the steps."""
+    """Return the first episode: a row for the truth and for each method; some of the steps."""
     shown = {TITLES[method]: part[0].shown for method, part in results.items()}
     first = next(iter(shown.values()))
     rows = {"simulator": [one.truth for one in first], **{who: [one.ours for one in row] for who, row in shown.items()}}

@@ -1,8 +1,9 @@
-"""A predicted future as pictures, beside what the simulator shows (paper, figure 6)."""
+"""Show a predicted future as pictures, beside those of the simulator (paper, figure 6)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,8 +36,8 @@ class VisualPrediction:
         state: what it starts from.
         rollouts: what is predicted.
         actions: of these rollouts [m/s].
-        sequence: which of them.
-        camera: that looks.
+        sequence: index of the one that is shown.
+        camera: of the pictures.
         folder: for STEP.png (predicted), STEP_true.png, the contact sheet prediction.png and psnr.json.
     """
 
@@ -51,7 +52,7 @@ class VisualPrediction:
 def show_prediction(
     request: VisualPrediction, renderer: SceneRenderer, assets: AssetLibrary | None
 ) -> Iterator[Progress]:
-    """Render each step through the fields and, where meshes are there, simulate and render it truly.
+    """Render each step through the fields and, where meshes are there, simulate and trace it.
 
     Args:
         request: what to show.
@@ -69,12 +70,11 @@ def show_prediction(
         yield Progress(step, len(states), f"Rendering step {step} of {len(states) - 1}")
         ours = renderer.render(SceneBatch.of(state), (request.camera,), quality=_QUALITY).rgb[0, 0]
         write_png(request.folder / f"{step:03d}.png", to_uint8(ours))
-        if truth is None:
-            continue
-        true = next(truth)
-        write_png(request.folder / f"{step:03d}_true.png", to_uint8(true))
-        psnrs.append(round(psnr(true, ours), 3))
-        columns.append(Comparison(f"{step}: {psnrs[-1]:.1f} dB", to_uint8(true), to_uint8(ours)))
+        if truth is not None:
+            true = next(truth)
+            write_png(request.folder / f"{step:03d}_true.png", to_uint8(true))
+            psnrs.append(round(psnr(true, ours), 3))
+            columns.append(Comparison(f"{step}: {psnrs[-1]:.1f} dB", to_uint8(true), to_uint8(ours)))
     if columns:
         stride = -(-len(columns) // _MOST_COLUMNS)
         sheet = contact_sheet(columns[::stride], per_row=_MOST_COLUMNS, truth="simulator")
@@ -83,30 +83,20 @@ def show_prediction(
     yield Progress(len(states), len(states), "Everything is rendered")
 
 
-def predicted_states(request: VisualPrediction) -> tuple[SceneState, ...]:
-    """The scene before the first and after each action."""
+def predicted_states(request: VisualPrediction) -> list[SceneState]:
+    """Return the scene before the first and after each action."""
     rollouts, k = request.rollouts, request.sequence
-    return tuple(
-        SceneState(
-            rollouts.names,
-            Pose(rollouts.positions[k, t], rollouts.quaternions[k, t]),
-            request.state.light,
-            rollouts.pusher[k, t],
-        )
-        for t in range(rollouts.positions.shape[1])
-    )
+    steps = zip(rollouts.positions[k], rollouts.quaternions[k], rollouts.pusher[k], strict=True)
+    return [SceneState(rollouts.names, Pose(p, q), request.state.light, pusher) for p, q, pusher in steps]
 
 
 def _simulated(request: VisualPrediction, assets: AssetLibrary) -> Iterator[Float[np.ndarray, "h w 3"]]:
-    """What the camera would truly see."""
+    """Yield what the camera would truly see."""
     from osfcore.world.tabletop import Tabletop  # predictions alone do without the simulator
 
-    world = Tabletop(assets, cameras=(request.camera,))
-    try:
+    with closing(Tabletop(assets, cameras=(request.camera,))) as world:
         world.restore(request.state)
         yield world.observe().images[0]
         for action in request.actions[request.sequence]:
             world.act(action)
             yield world.observe().images[0]
-    finally:
-        world.close()

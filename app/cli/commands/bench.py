@@ -76,7 +76,7 @@ class BenchRenderCommand(_Benchmark):
         assert last.report is not None, "the last step brings the report"
         if self.out is not None:
             write_png(self.out / _PICTURE, contact_sheet(last.report.shown, truth="Tiny"))
-        return last.report.to_json()
+        return last.report.figures
 
     def _show(self, result: dict[str, Any]) -> None:
         _show_render(result)
@@ -101,7 +101,7 @@ class BenchEstimateCommand(_Benchmark):
         last = follow(bench_estimate(config, FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")))
         assert last is not None
         assert last.report is not None, "the last step brings the report"
-        return last.report.to_json()
+        return last.report
 
     def _show(self, result: dict[str, Any]) -> None:
         print(
@@ -121,13 +121,14 @@ class BenchDynamicsCommand(_Benchmark):
 
     def _measure(self) -> dict[str, Any]:
         from osfcore.dynamics.graph import read_network
-        from osfcore.dynamics.rollout import load_shapes, network_path
+        from osfcore.dynamics.rollout import PushModel, load_shapes, network_path
         from osfcore.experiments.bench_rollouts import BENCH_NAMES, bench_rollouts
         from osfcore.fields.devices import pick_device
         from osfcore.fields.field_library import FieldLibrary
 
         shapes = load_shapes(self.data_dir, FieldLibrary(self.data_dir), BENCH_NAMES)
-        return asdict(bench_rollouts(read_network(network_path(self.data_dir)), shapes, pick_device(self.device)))
+        model = PushModel(read_network(network_path(self.data_dir)), shapes, pick_device(self.device))
+        return asdict(bench_rollouts(model, shapes))
 
     def _show(self, result: dict[str, Any]) -> None:
         from osfcore.experiments.bench_rollouts import BENCH_NAMES, HORIZON, SEQUENCES
@@ -162,7 +163,7 @@ class BenchPlannerCommand(_Benchmark):
         last = follow(bench_planner(BenchPlanner(self.tasks, **settings)))
         assert last is not None
         assert last.report is not None, "the last step brings the report"
-        return {**settings, **last.report.to_json()}
+        return {**settings, **last.report}
 
     def _show(self, result: dict[str, Any]) -> None:
         _show_planners(result)

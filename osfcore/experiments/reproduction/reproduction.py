@@ -5,32 +5,32 @@ from __future__ import annotations
 import base64
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from osfcore.errors import InvalidInput, OsfError, check_seed
+from osfcore.errors import InvalidInput, check_seed
 from osfcore.experiments import relighting, video_prediction
 from osfcore.experiments.charts import Axis, Bar, Chart, Curve, write_bars, write_charts
-from osfcore.experiments.harness import EvaluationStep, Piece, TaskResult, finished, holm, share_interval
-from osfcore.experiments.images import FIELD_METHODS, TITLES, common_names
-from osfcore.experiments.rearrangement import EvaluateMpc, episode_pieces, episodes_report, figures_of
+from osfcore.experiments.harness import EvaluationStep, Piece, TaskResult, finished
+from osfcore.experiments.methods import FIELD_METHODS, TITLES, common_names
+from osfcore.experiments.rearrangement import EvaluateMpc, checked, episode_pieces, episodes_report, figures_of
 from osfcore.experiments.rearrangement_report import MpcReport, paired
 from osfcore.experiments.relighting import CompareRelighting, compare_relighting
 from osfcore.experiments.reproduction.sections import (
     SECTIONS,
-    Cell,
     Scale,
     Section,
     SectionName,
     objects_in_words,
     sections_of,
 )
+from osfcore.experiments.statistics import holm, share_interval
 from osfcore.experiments.video_prediction import CompareVideos, compare_videos
+from osfcore.extras import need
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_atomically, write_json
 from osfcore.metrics.success import RearrangementScore
@@ -38,16 +38,17 @@ from osfcore.objects.asset_library import AssetLibrary
 
 # Measuring the cells of a report side by side, and what their results say next to each other.
 
+Steps = Iterator[EvaluationStep[dict[str, Any]]]
 
-@dataclass(frozen=True, eq=False, slots=True)
-class MeasuredCell:
-    """A cell with what was found.
+
+class MeasuredCell(NamedTuple):
+    """Results of a cell.
 
     Attributes:
         label: in tables and charts.
         report: all results.
         figures: of the report, as plain JSON.
-        against: the section's first cell, task by task; None for that cell itself.
+        against: comparison with the section's first cell, task by task; None for that cell itself and for other tasks.
     """
 
     label: str
@@ -56,14 +57,8 @@ class MeasuredCell:
     against: Mapping[str, Any] | None
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class MeasuredSection:
-    """A section with what was found.
-
-    Attributes:
-        section: what was asked.
-        cells: in its order.
-    """
+class MeasuredSection(NamedTuple):
+    """A section with the results of its cells, in their order."""
 
     section: Section
     cells: tuple[MeasuredCell, ...]
@@ -71,7 +66,7 @@ class MeasuredSection:
 
 def measure_cells(
     sections: Sequence[Section], fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Generator[EvaluationStep, None, tuple[MeasuredSection, ...]]:
+) -> Generator[EvaluationStep[Any], None, list[MeasuredSection]]:
     """Run the episodes of all sections, each once.
 
     Args:
@@ -81,44 +76,41 @@ def measure_cells(
         executor: runs episodes side by side, if given.
 
     Returns:
-        What was found, in the order of the sections.
+        Results in the order of the sections.
 
     Raises:
         UnknownName, MissingAssets, InvalidInput, NoRoom, WorkerDied, CorruptFile, CannotWrite: as `evaluate_mpc` does.
     """
-    keys = {id(cell): _piece_keys(cell, fields, assets) for section in sections for cell in section.cells}
-    pieces: dict[tuple[str, str], Piece] = {key: piece for found in keys.values() for key, piece in found}
-    results = yield from finished(list(pieces.values()), executor, "episodes")
-    found = dict(zip(pieces, results, strict=True))
-    return tuple(
-        _measured(section, [[found[key] for key, _ in keys[id(cell)]] for cell in section.cells])
+    pieces = [
+        [episode_pieces(checked(cell.config, fields, assets), fields, assets) for cell in section.cells]
         for section in sections
-    )
+    ]
+    unique = {_place(piece): piece for cells in pieces for own in cells for piece in own}
+    results = yield from finished(list(unique.values()), executor, "episodes")
+    found = dict(zip(unique, results, strict=True))
+    return [
+        _measured(section, [[found[_place(piece)] for piece in own] for own in cells])
+        for section, cells in zip(sections, pieces, strict=True)
+    ]
 
 
-def _piece_keys(cell: Cell, fields: FieldLibrary, assets: AssetLibrary) -> list[tuple[tuple[str, str], Piece]]:
-    """A cell's pieces by where they are kept, which tells them from all others."""
-    return [((str(p.cache.folder), p.name), p) for p in episode_pieces(cell.config, fields, assets)]
+def _place(piece: Piece) -> tuple[Path, str]:
+    """Return where a piece is kept, which is the same for equal pieces of several cells."""
+    return piece.cache.folder, piece.name
 
 
 def _measured(section: Section, results: Sequence[Sequence[TaskResult]]) -> MeasuredSection:
     reports = [episodes_report(cell.config, found) for cell, found in zip(section.cells, results, strict=True)]
-    first = reports[0].shipped
-    cells = [
-        MeasuredCell(
-            cell.label,
-            report,
-            figures_of(cell.config, report),
-            None if number == 0 or not _same_tasks(section, number) else paired(report.shipped, first),
-        )
-        for number, (cell, report) in enumerate(zip(section.cells, reports, strict=True))
-    ]
+    cells = []
+    for number, (cell, report) in enumerate(zip(section.cells, reports, strict=True)):
+        is_comparable = number > 0 and _same_tasks(section.cells[0].config, cell.config)
+        against = paired(report.shipped, reports[0].shipped) if is_comparable else None
+        cells.append(MeasuredCell(cell.label, report, figures_of(cell.config, report), against))
     return MeasuredSection(section, tuple(cells))
 
 
-def _same_tasks(section: Section, number: int) -> bool:
-    """Whether a cell has the first one's tasks: another family has others, but for another light of the goal image."""
-    one, other = section.cells[0].config, section.cells[number].config
+def _same_tasks(one: EvaluateMpc, other: EvaluateMpc) -> bool:
+    """Return whether two cells have the same tasks: families differ in them, but for the light of the goal image."""
     places = {config.family.replace("relit", "shifted") for config in (one, other)}
     return len(places) == 1 and (one.objects, one.tasks) == (other.objects, other.tasks)
 
@@ -129,16 +121,9 @@ def _same_tasks(section: Section, number: int) -> bool:
 _TEMPLATE = "page.html.jinja"
 
 
-class MissingJinja(OsfError):
-    """The report cannot be written."""
-
-    def __init__(self) -> None:
-        super().__init__("The report needs jinja2; install it with: pip install 'osf-manipulation[experiments]'.")
-
-
 @dataclass(frozen=True, slots=True)
 class About:
-    """How a report came about.
+    """Circumstances of a report.
 
     Attributes:
         date: of the run.
@@ -155,8 +140,7 @@ class About:
     names: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class PagePart:
+class PagePart(NamedTuple):
     """One part of the page.
 
     Attributes:
@@ -169,21 +153,9 @@ class PagePart:
 
     title: str
     text: str
-    pictures: Sequence[tuple[Path, str]] = ()
-    heads: Sequence[str] = ()
-    rows: Sequence[Sequence[str]] = field(default=())
-
-
-def check_jinja() -> None:
-    """Check that a page can be written.
-
-    Raises:
-        MissingJinja: if it cannot.
-    """
-    try:
-        import jinja2  # noqa: F401  an extra, not among what every installation has
-    except ImportError:
-        raise MissingJinja from None
+    pictures: Sequence[tuple[Path, str]]
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
 
 
 def write_page(
@@ -193,32 +165,22 @@ def write_page(
 
     Args:
         path: of the HTML file.
-        about: how it came about.
+        about: circumstances of the report.
         warnings: what a reader must know first.
         findings: in sentences.
         parts: from top to bottom.
 
     Raises:
         CannotWrite: if the disk refuses.
-        MissingJinja: if jinja2 is not installed.
+        MissingExtra: if jinja2 is not installed.
     """
-    check_jinja()
+    need("experiments", "The report")
     import jinja2
 
     template = (files("osfcore.experiments.reproduction") / _TEMPLATE).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
-    shown = [
-        {
-            "title": part.title,
-            "text": part.text,
-            "pictures": [{"data": _data_url(picture), "alt": alt} for picture, alt in part.pictures],
-            "heads": part.heads,
-            "rows": part.rows,
-        }
-        for part in parts
-    ]
-    page = environment.from_string(template).render(about=about, warnings=warnings, findings=findings, parts=shown)
-    write_atomically(path, page.encode())
+    given = {"about": about, "warnings": warnings, "findings": findings, "parts": parts, "data_url": _data_url}
+    write_atomically(path, environment.from_string(template).render(given).encode())
 
 
 def _data_url(path: Path) -> str:
@@ -256,7 +218,7 @@ def _success_chart(section: MeasuredSection) -> Chart:
 
 
 def _curve(name: str, scores: Sequence[RearrangementScore]) -> Curve:
-    """The share of tasks within each threshold, with Wilson's interval."""
+    """Return the share of tasks within each threshold, with Wilson's interval."""
     places = np.linspace(_DISTANCE.low, _DISTANCE.high or 0.0, _POINTS)
     distances = np.sort([score.pose6d_symmetric for score in scores])
     counts = np.searchsorted(distances, places, side="right")
@@ -274,57 +236,56 @@ def write_success_bars(path: Path, section: MeasuredSection) -> None:
     Raises:
         CannotWrite: if the disk refuses.
     """
-    axis = Axis("share of tasks within 2 cm and 0.1 rad", 0, 1)
-    write_bars(path, section.section.title, axis, [_bar(cell) for cell in section.cells])
-
-
-def _bar(cell: MeasuredCell) -> Bar:
-    low, high = cell.figures["success_tight_interval"]
-    return Bar(cell.label, cell.figures["success_tight"], low, high)
+    key, axis = "success_tight", Axis("share of tasks within 2 cm and 0.1 rad", 0, 1)
+    bars = [Bar(cell.label, cell.figures[key], *cell.figures[f"{key}_interval"]) for cell in section.cells]
+    write_bars(path, section.section.title, axis, bars)
 
 
 # What a report's sections say in sentences: who is ahead, who is not, and what costs most.
 
 
-_COMPARED: Mapping[str, str] = MappingProxyType(
-    {"success_tight": "within 2 cm and 0.1 rad", "success_2cm": "within 2 cm"}
-)
+_COMPARED = {"success_tight": "within 2 cm and 0.1 rad", "success_2cm": "within 2 cm"}
 _SIGNIFICANT = 0.05
 MOST_LOST = 0.15  # of success, that one factor of variation may cost
 _HALF = 0.5
 
 
-def findings(sections: Sequence[MeasuredSection]) -> tuple[str, ...]:
-    """One sentence for each comparison of the methods, for the mean distance, and for what costs too much."""
+def findings(sections: Sequence[MeasuredSection]) -> list[str]:
+    """Return a sentence for each comparison of the methods, for the mean distance, and for what costs too much."""
     methods = [section for section in sections if section.section.name == "methods"]
     comparisons = [
         (section.cells[0], cell, key) for section in methods for cell in section.cells[1:] for key in _COMPARED
     ]
-    corrected = holm([_gap_of(cell, key)["p"] for _, cell, key in comparisons])
-    told = [_method(*one, p) for one, p in zip(comparisons, corrected, strict=True)]
-    told += [_distance(section.cells[0]) for section in methods]
+    corrected = holm([_gap(cell, key)["p"] for _, cell, key in comparisons])
+    sentences = [_method(*one, p) for one, p in zip(comparisons, corrected, strict=True)]
+    sentences += [_distance(section.cells[0]) for section in methods]
     for section in sections:
         if section.section.name == "factors":
-            told += _costly(section)
-    return tuple(told)
+            sentences += _costly(section)
+    return sentences
 
 
-def _gap_of(cell: MeasuredCell, key: str) -> Mapping[str, Any]:
-    assert cell.against is not None, "all methods and all factors have the same tasks"
-    return cell.against[key]
+def _gap(cell: MeasuredCell, key: str) -> Mapping[str, Any]:
+    """Return how a cell differs from the first of its section; all methods and all factors have the same tasks."""
+    return (cell.against or {})[key]
+
+
+def _lead(cell: MeasuredCell, key: str) -> tuple[float, float, float]:
+    """Return by how much the first cell is ahead of another one, and the interval [percent]."""
+    gap = _gap(cell, key)  # the other one minus the first
+    low, high = (-100 * end for end in reversed(gap["interval"]))
+    return 100 * (0.0 - gap["difference"]), low, high  # never -0
 
 
 def _method(ours: MeasuredCell, other: MeasuredCell, key: str, corrected: float) -> str:
-    """Ours against another method; who is better is said where p, corrected for all comparisons, is below 5 %."""
-    gap = _gap_of(other, key)  # the other one minus ours
-    low, high = (-100 * end for end in reversed(gap["interval"]))
-    lead = 0.0 - gap["difference"]  # never -0
+    """Compare ours with another method; who is better is said where p, corrected for all comparisons, is below 5 %."""
+    lead, low, high = _lead(other, key)
     better = "ours is better" if lead > 0 else "ours is worse"
     verdict = better if corrected < _SIGNIFICANT else "no difference is shown"
     return (
-        f"{_objects(ours)}, ours and {other.label}, {_COMPARED[key]}: {_percent(ours, key)} against "
-        f"{_percent(other, key)}, which is {100 * lead:+.0f} points (95 %: {low:+.0f} to {high:+.0f}; "
-        f"McNemar p = {gap['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
+        f"{_objects(ours)}, ours and {other.label}, {_COMPARED[key]}: {100 * ours.figures[key]:.0f} % against "
+        f"{100 * other.figures[key]:.0f} %, which is {lead:+.0f} points (95 %: {low:+.0f} to {high:+.0f}; "
+        f"McNemar p = {_gap(other, key)['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
     )
 
 
@@ -339,11 +300,10 @@ def _distance(ours: MeasuredCell) -> str:
 
 def _costly(section: MeasuredSection) -> Iterator[str]:
     for cell in section.cells[1:]:
-        gap = _gap_of(cell, "success_tight")
-        low, high = (-100 * end for end in reversed(gap["interval"]))
-        if -gap["difference"] > MOST_LOST:
+        lost, low, high = _lead(cell, "success_tight")
+        if -_gap(cell, "success_tight")["difference"] > MOST_LOST:
             yield (
-                f"Under {cell.label} {-100 * gap['difference']:.0f} points of success are lost (95 %: {low:.0f} to "
+                f"Under {cell.label} {lost:.0f} points of success are lost (95 %: {low:.0f} to "
                 f"{high:.0f}), more than {100 * MOST_LOST:.0f}."
             )
 
@@ -352,12 +312,14 @@ def _objects(cell: MeasuredCell) -> str:
     return objects_in_words(cell.figures["objects"])
 
 
-def _percent(cell: MeasuredCell, key: str) -> str:
-    return f"{100 * cell.figures[key]:.0f} %"
+_HEADS = (
+    "", "tasks", "2 cm and 0.1 rad", "2 cm", "refused", "6D mean", "with symmetry", "its median", "first frame [mm]",
+    "[deg]", "light [deg]", "points against the first row",
+)  # fmt: skip
 
 
-def rows_of(section: MeasuredSection) -> list[dict[str, Any]]:
-    """The rows of a section's table, the oracle's and those of doing nothing among them, as plain words."""
+def rows_of(section: MeasuredSection) -> list[list[str]]:
+    """Return the rows of a section's table, those of the oracle and of doing nothing among them, as plain words."""
     rows = [_row(cell.label, cell.figures, "", cell) for cell in section.cells]
     first = section.cells[0]
     if first.report.oracle:
@@ -366,43 +328,37 @@ def rows_of(section: MeasuredSection) -> list[dict[str, Any]]:
     return rows
 
 
-def _row(label: str, figures: Any, who: str, cell: MeasuredCell | None = None) -> dict[str, Any]:  # noqa: ANN401
-    row = {"label": label, "tasks": figures["tasks"]}
-    for key in ("success_tight", "success_2cm"):
-        row[key] = _share(figures[who + key], figures[f"{who}{key}_interval"])
-    for key in ("pose6d_mean", "pose6d_symmetric_mean", "pose6d_symmetric_median"):
-        row[key] = f"{figures[who + key]:.3f}"
-    own = dict.fromkeys(("refused", "first_mm", "first_deg", "light_deg", "against"), "")
+def _row(label: str, figures: Mapping[str, Any], who: str, cell: MeasuredCell | None = None) -> list[str]:
+    shares = []
+    for key in _COMPARED:
+        low, high = figures[f"{who}{key}_interval"]
+        shares.append(f"{100 * figures[who + key]:.0f} % ({100 * low:.0f} to {100 * high:.0f})")
+    distances = ("pose6d_mean", "pose6d_symmetric_mean", "pose6d_symmetric_median")
+    refused, errors, gap = "", ["", "", ""], ""
     if cell is not None:
-        own["refused"] = str(figures["refused"])
-        for key in ("first_mm", "first_deg", "light_deg"):
-            value = figures[f"{key}_median"]
-            own[key] = "" if value is None else f"{value:.2f}"
-        own["against"] = "" if cell.against is None else _gap(cell.against["success_tight"])
-    return {**row, **own}
-
-
-def _share(value: float, interval: Sequence[float]) -> str:
-    low, high = interval
-    return f"{100 * value:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
-
-
-def _gap(gap: Any) -> str:  # noqa: ANN401
-    low, high = gap["interval"]
-    return f"{100 * gap['difference']:+.0f} ({100 * low:+.0f} to {100 * high:+.0f}), p = {gap['p']:.2g}"
+        refused = str(figures["refused"])
+        medians = [figures[f"{key}_median"] for key in ("first_mm", "first_deg", "light_deg")]
+        errors = ["" if value is None else f"{value:.2f}" for value in medians]
+        if cell.against is not None:
+            ahead = cell.against["success_tight"]
+            low, high = ahead["interval"]
+            gap = f"{100 * ahead['difference']:+.0f} ({100 * low:+.0f} to {100 * high:+.0f}), p = {ahead['p']:.2g}"
+    six_d = [f"{figures[who + key]:.3f}" for key in distances]
+    return [label, str(figures["tasks"]), *shares, refused, *six_d, *errors, gap]
 
 
 # The parts of a report that compare images: relit scenes (Fig. 5) and predicted videos (Fig. 6).
 
 
 def relighting_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
-    """Scenes under lights of all elevations.
+    """Return the part on scenes under lights of all elevations.
 
     Args:
         folder: with the pictures.
         report: of `compare_relighting`.
     """
-    columns = [(key, relighting.ALL, title) for key, title in _RELIT.items()]
+    titles = {"psnr": "PSNR [dB]", "ssim": "SSIM", "psnr_object": "on objects [dB]", "psnr_shadow": "in shadow [dB]"}
+    columns = [(key, relighting.ALL, title) for key, title in titles.items()]
     text = (
         f"{report['tasks']} scenes of {objects_in_words(report['objects'])}, poses and light given, under lights "
         f"between {min(report['elevations_deg']):g} and {max(report['elevations_deg']):g} deg above the table."
@@ -415,14 +371,14 @@ def relighting_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
 
 
 def video_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
-    """Pushes predicted as images.
+    """Return the part on pushes predicted as images.
 
     Args:
         folder: with the pictures.
         report: of `compare_videos`.
     """
-    spans = list(next(iter(report["methods"].values()))["psnr"]["spans"])
-    columns = [(key, span, f"{title}, {span} steps") for span in spans for key, title in _VIDEO.items()]
+    spans, titles = next(iter(report["methods"].values()))["psnr"]["spans"], {"psnr": "PSNR [dB]", "ssim": "SSIM"}
+    columns = [(key, span, f"{title}, {span} steps") for span in spans for key, title in titles.items()]
     text = (
         f"{report['tasks']} episodes of {objects_in_words(report['objects'])}, {report['steps']} actions known "
         "in advance, from the first frame's estimate; FitVid sees two frames of the goal camera."
@@ -434,14 +390,10 @@ def video_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
     return PagePart("Predicted futures as images (Fig. 6)", text, pictures, *_table(report, columns))
 
 
-_RELIT = {"psnr": "PSNR [dB]", "ssim": "SSIM", "psnr_object": "on objects [dB]", "psnr_shadow": "in shadow [dB]"}
-_VIDEO = {"psnr": "PSNR [dB]", "ssim": "SSIM"}
-
-
 def _table(
     report: Mapping[str, Any], columns: Sequence[tuple[str, str, str]]
 ) -> tuple[tuple[str, ...], list[list[str]]]:
-    """Heads and rows: means with intervals, and ours against each other method in the first column's measure."""
+    """Return heads and rows: means with intervals, and how much ours is ahead in the first column's measure."""
     key, span, _ = columns[0]
     rows = []
     for method, measures in report["methods"].items():
@@ -451,13 +403,13 @@ def _table(
     return ("", *(title for _, _, title in columns), "ours better by [dB]"), rows
 
 
-def _interval(told: Mapping[str, Any], what: str) -> str:
-    if told[what] is None:
+def _interval(figure: Mapping[str, Any], what: str) -> str:
+    if figure[what] is None:
         return "-"
-    if told["interval"] is None:
-        return f"{told[what]:.3g}"
-    low, high = told["interval"]
-    return f"{told[what]:.3g} ({low:.3g} to {high:.3g})"
+    if figure["interval"] is None:
+        return f"{figure[what]:.3g}"
+    low, high = figure["interval"]
+    return f"{figure[what]:.3g} ({low:.3g} to {high:.3g})"
 
 
 # `osf reproduce`: the paper's experiments, with its rivals and what else there is to know, in one report.
@@ -472,14 +424,6 @@ PartName = Literal["relighting", "video"] | SectionName
 PARTS: tuple[PartName, ...] = ("relighting", "video", *SECTIONS)
 _TITLES = {"relighting": "Scenes under any light", "video": "Predicted futures"}
 _IMAGE_PARTS = {"relighting": relighting_part, "video": video_part}
-_HEADS = (
-    "", "tasks", "2 cm and 0.1 rad", "2 cm", "refused", "6D mean", "with symmetry", "its median", "first frame [mm]",
-    "[deg]", "light [deg]", "points against the first row",
-)  # fmt: skip
-_KEYS = (
-    "label", "tasks", "success_tight", "success_2cm", "refused", "pose6d_mean", "pose6d_symmetric_mean",
-    "pose6d_symmetric_median", "first_mm", "first_deg", "light_deg", "against",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -489,7 +433,7 @@ class Reproduce:
     Attributes:
         folder: for report.html, reproduction.json, pictures, and all results.
         data_dir: where objects, fields and networks of this machine are.
-        about: what the page tells of its making; its names are filled in.
+        about: circumstances, as the page shows them; the names are filled in.
         scale: how much is measured.
         is_quick: whether the page must warn that it is little.
         parts: of the report.
@@ -505,9 +449,7 @@ class Reproduce:
     names: tuple[str, ...] | None = None
 
 
-def reproduce(
-    config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[EvaluationStep]:
+def reproduce(config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None) -> Steps:
     """Measure what is not measured yet, and write the report.
 
     Args:
@@ -519,81 +461,61 @@ def reproduce(
     Raises:
         UnknownName, MissingAssets: if an object lacks a field or a mesh.
         InvalidInput: if a number or name is out of range.
-        MissingJinja, MissingMatplotlib: if these are not installed.
+        MissingExtra: if what writes pages or draws charts is not installed.
         NoRoom, WorkerDied, CorruptFile, CannotWrite: as for evaluations.
     """
-    check_jinja()
+    need("experiments", "The report")
     check_seed(config.about.seed)
     for part in config.parts:
         if part not in PARTS:
             raise InvalidInput("part of the report", part, ", ".join(PARTS))
     names = common_names(FIELD_METHODS, config.names, fields, assets, config.data_dir, config.scale.objects)
     config = replace(config, about=replace(config.about, names=names))
-    images = yield from _images(config, fields, assets, executor)
-    measured = yield from _episodes(config, fields, assets, executor)
+    images: dict[str, dict[str, Any]] = {}
+    for name, steps in _image_comparisons(config, fields, assets, executor).items():
+        for step in steps:
+            yield EvaluationStep(step.done, step.total, f"{_TITLES[name]}: {step.note}")
+            images[name] = step.report or {}
+    base = EvaluateMpc(config.folder, config.data_dir, seed=config.about.seed, names=names)
+    chosen: tuple[SectionName, ...] = tuple(name for name in SECTIONS if name in config.parts)
+    measured = yield from measure_cells(sections_of(base, config.scale, chosen), fields, assets, executor)
     report = _figures(config, images, measured)
     write_json(config.folder / FIGURES_FILE, report)
     parts = [_IMAGE_PARTS[name](config.folder, figures) for name, figures in images.items()]
     parts += _section_parts(config.folder, measured)
-    write_page(config.folder / PAGE_FILE, config.about, _warnings(config), findings(measured), parts)
+    write_page(config.folder / PAGE_FILE, config.about, _warnings(config), report["findings"], parts)
     yield EvaluationStep(1, 1, "The report is written", report)
 
 
-def _images(
+def _image_comparisons(
     config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None
-) -> Generator[EvaluationStep, None, dict[str, dict[str, Any]]]:
-    """The reports of parts that compare images, by name."""
+) -> dict[str, Steps]:
+    """Return the parts that compare images, not begun."""
     scale, about = config.scale, config.about
     given = {"names": about.names, "seed": about.seed, "objects": scale.objects}
     relit = CompareRelighting(config.folder, config.data_dir, tasks=scale.scenes, **given)
     videos = CompareVideos(config.folder, config.data_dir, tasks=scale.videos, **given)
     comparisons = {
-        "relighting": lambda: compare_relighting(relit, fields, assets, executor),
-        "video": lambda: compare_videos(videos, fields, assets, executor),
+        "relighting": compare_relighting(relit, fields, assets, executor),
+        "video": compare_videos(videos, fields, assets, executor),
     }
-    reports: dict[str, dict[str, Any]] = {}
-    for name in (part for part in comparisons if part in config.parts):
-        for step in comparisons[name]():
-            yield EvaluationStep(step.done, step.total, f"{_TITLES[name]}: {step.note}")
-            reports[name] = step.report or {}
-    return reports
-
-
-def _episodes(
-    config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None
-) -> Generator[EvaluationStep, None, tuple[MeasuredSection, ...]]:
-    """Episodes of all sections."""
-    base = EvaluateMpc(config.folder, config.data_dir, seed=config.about.seed, names=config.about.names)
-    chosen: tuple[SectionName, ...] = tuple(name for name in SECTIONS if name in config.parts)
-    sections = sections_of(base, config.scale, chosen)
-    return (yield from measure_cells(sections, fields, assets, executor))
+    return {name: steps for name, steps in comparisons.items() if name in config.parts}
 
 
 def _figures(config: Reproduce, images: Mapping[str, Any], measured: Sequence[MeasuredSection]) -> dict[str, Any]:
-    return {
-        "about": asdict(config.about),
-        "quick": config.is_quick,
-        **images,
-        "findings": list(findings(measured)),
-        "sections": [
-            {
-                "name": section.section.name,
-                "title": section.section.title,
-                "cells": [
-                    {"label": cell.label, "figures": dict(cell.figures), "against_first": cell.against}
-                    for cell in section.cells
-                ],
-            }
-            for section in measured
-        ],
-    }
+    sections = []
+    for section, cells in measured:
+        rows = [{"label": c.label, "figures": dict(c.figures), "against_first": c.against} for c in cells]
+        sections.append({"name": section.name, "title": section.title, "cells": rows})
+    about = {"about": asdict(config.about), "quick": config.is_quick}
+    return {**about, **images, "findings": findings(measured), "sections": sections}
 
 
 def _warnings(config: Reproduce) -> list[str]:
-    """What a reader must know before anything else."""
-    scale, told = config.scale, list[str]()
+    """Return what a reader must know before anything else."""
+    scale, warnings = config.scale, list[str]()
     if config.is_quick:
-        told.append(
+        warnings.append(
             f"A quick look and no measurement: {scale.tasks} tasks a cell, {scale.settings.steps} actions instead of "
             f"30, plans of {scale.settings.plan.samples} sequences, {objects_in_words(scale.objects)}, "
             f"and only the factor {', '.join(scale.factors)}. Cells that take "
@@ -601,23 +523,21 @@ def _warnings(config: Reproduce) -> list[str]:
         )
     left_out = [part for part in PARTS if part not in config.parts]
     if left_out:
-        told.append(f"Parts left out: {', '.join(left_out)}.")
-    return told
+        warnings.append(f"Parts left out: {', '.join(left_out)}.")
+    return warnings
 
 
 def _section_parts(folder: Path, measured: Sequence[MeasuredSection]) -> list[PagePart]:
-    parts: list[PagePart] = []
     methods = [section for section in measured if section.section.name == "methods"]
-    if methods:
-        write_success_curves(folder / _CURVES, methods)
+    parts: list[PagePart] = []
     for section in measured:
         about, pictures = section.section, list[tuple[Path, str]]()
-        if section is methods[0] if methods else False:
-            pictures.append((folder / _CURVES, "Share of tasks within each 6D distance, for each number of objects"))
         if about.name != "methods":
             picture = folder / f"{about.name}.png"
             write_success_bars(picture, section)
             pictures.append((picture, f"{about.title}: share of tasks within 2 cm and 0.1 rad"))
-        rows = [[str(row[key]) for key in _KEYS] for row in rows_of(section)]
-        parts.append(PagePart(about.title, about.text, pictures, _HEADS, rows))
+        elif section is methods[0]:  # one picture for all numbers of objects
+            write_success_curves(folder / _CURVES, methods)
+            pictures.append((folder / _CURVES, "Share of tasks within each 6D distance, for each number of objects"))
+        parts.append(PagePart(about.title, about.text, pictures, _HEADS, rows_of(section)))
     return parts

@@ -6,10 +6,8 @@ Cells that stand in several sections, such as ours in the usual world, are measu
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 from osfcore.control.events import EpisodeSettings
 from osfcore.experiments.factors import EPISODE_FACTORS
@@ -23,22 +21,15 @@ from osfcore.world.tasks import Family
 
 SectionName = Literal["methods", "families", "ablations", "ladder", "factors", "attribution"]
 SECTIONS: tuple[SectionName, ...] = get_args(SectionName)
-_LADDER: tuple[StageName, ...] = (
-    "estimation",
-    "dynamics",
-    "planning",
-    "fields",
-)  # ours take their places in this order
-_METHODS: Mapping[str, Variant] = MappingProxyType(
-    {
-        "ours": Variant(),
-        "as published": Variant("paper"),
-        "compositional NeRF": Variant("nerf"),
-        "visual foresight": Variant("foresight"),
-        "light overhead": Variant("overhead"),
-        "light known": Variant("known_light"),
-    }
-)
+_LADDER: tuple[StageName, ...] = ("estimation", "dynamics", "planning", "fields")  # the order in which ours come in
+_METHODS = {
+    "ours": Variant(),
+    "as published": Variant("paper"),
+    "compositional NeRF": Variant("nerf"),
+    "visual foresight": Variant("foresight"),
+    "light overhead": Variant("overhead"),
+    "light known": Variant("known_light"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,27 +73,20 @@ QUICK = Scale(
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """One method on one set of tasks.
-
-    Attributes:
-        label: in tables and charts.
-        config: what is measured.
-    """
+class Cell(NamedTuple):
+    """One method on one set of tasks, with its label in tables and charts."""
 
     label: str
     config: EvaluateMpc
 
 
-@dataclass(frozen=True, slots=True)
-class Section:
+class Section(NamedTuple):
     """Cells that are compared.
 
     Attributes:
         name: of the section.
         title: over it.
-        text: that tells what is compared.
+        text: on what is compared.
         cells: the first of which all others are compared with.
     """
 
@@ -113,12 +97,12 @@ class Section:
 
 
 def objects_in_words(count: int) -> str:
-    """Such as "1 object"."""
+    """Return words such as "1 object"."""
     return f"{count} object{'s' * (count > 1)}"
 
 
 def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...] = SECTIONS) -> tuple[Section, ...]:
-    """All sections with cells, in their order.
+    """Return all sections with two cells or more, in their order.
 
     Args:
         base: where results are kept, the objects to draw from, and the seed.
@@ -131,13 +115,9 @@ def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...]
         published=scale.published, foresight=scale.foresight,
     )  # fmt: skip
     makers = {
-        "methods": _methods,
-        "families": _families,
-        "ablations": _ablations,
-        "ladder": _ladder,
-        "factors": _factors,
+        "methods": _methods, "families": _families, "ablations": _ablations, "ladder": _ladder, "factors": _factors,
         "attribution": _attribution,
-    }
+    }  # fmt: skip
     sections = [section for name in SECTIONS if name in chosen for section in makers[name](base, scale)]
     return tuple(section for section in sections if len(section.cells) > 1)
 
@@ -173,23 +153,17 @@ def _families(base: EvaluateMpc, scale: Scale) -> list[Section]:
 
 def _ablations(base: EvaluateMpc, scale: Scale) -> list[Section]:
     plan = base.settings.plan
-    cells = [Cell("ours", base)]
-    cells += [
-        Cell(f"{n} view{'s' * (n > 1)}", replace(base, variant=Variant(views=n)))
-        for n in (1, 2)[: 1 + scale.has_slow_cells]
-    ]
+    cells = [Cell("ours", base), Cell("1 view", replace(base, variant=Variant(views=1)))]
     if scale.has_slow_cells:
-        for label, change in (
-            (f"K = {plan.samples // 4}", {"samples": plan.samples // 4}),
-            (f"T = {plan.horizon // 3}", {"horizon": plan.horizon // 3}),
-        ):
-            settings = replace(base.settings, plan=replace(plan, **change))
-            cells.append(Cell(label, replace(base, settings=settings)))
-    cells += [Cell("cost of rendered images", replace(base, cost="image"))]
+        cells.append(Cell("2 views", replace(base, variant=Variant(views=2))))
+        shorter = replace(plan, samples=plan.samples // 4), replace(plan, horizon=plan.horizon // 3)
+        for label, one in zip((f"K = {shorter[0].samples}", f"T = {shorter[1].horizon}"), shorter, strict=True):
+            cells.append(Cell(label, replace(base, settings=replace(base.settings, plan=one))))
+    cells.append(Cell("cost of rendered images", replace(base, cost="image")))
     if scale.has_slow_cells:
-        cells += [Cell("light overhead", replace(base, variant=Variant("overhead")))]
-    cells += [Cell("as published", replace(base, variant=Variant("paper")))]
-    cells += [Cell("as published, masks at every step", replace(base, variant=Variant("paper", has_masks=True)))]
+        cells.append(Cell("light overhead", replace(base, variant=Variant("overhead"))))
+    cells.append(Cell("as published", replace(base, variant=Variant("paper"))))
+    cells.append(Cell("as published, masks at every step", replace(base, variant=Variant("paper", has_masks=True))))
     text = (
         f"Ours has four views, K = {plan.samples} sequences of T = {plan.horizon} actions and a cost of poses. "
         "Masks are given in the first frame alone, but for the last row: the paper's evaluation has them at every step."

@@ -15,7 +15,7 @@ by one more stage in front, so that the coarsest maps stay 8 x 8 pixels; channel
 per stage, so that at 64 pixels there are 8 where the original has 64 (7.4 instead of 302 million parameters). Batch
 norm takes its statistics over all steps of a batch at once, not step by step. The frame predictor has no variance,
 which the original computes and never uses. The decoder changes the last context frame, where the original's draws a
-new one (`coders`). Encoder and decoder may compute in bfloat16. Predictions take the skip connections from the last
+new one. Encoder and decoder may compute in bfloat16. Predictions take the skip connections from the last
 context frame, as training does; the original takes those of the first one there. Actions are in units of the highest
 speed.
 """
@@ -71,7 +71,7 @@ class SqueezeExcitation(nn.Module):
         self.reduce, self.expand = nn.Linear(channels, squeezed), nn.Linear(squeezed, channels)
 
     def forward(self, x: Float[Tensor, "B c h w"]) -> Float[Tensor, "B c h w"]:
-        """The same with its channels scaled."""
+        """Return x with its channels scaled."""
         scale = self.expand(functional.relu(self.reduce(x.mean(dim=(2, 3))))).sigmoid()
         return x * scale[:, :, None, None]
 
@@ -94,7 +94,7 @@ class EncoderCell(nn.Module):
         self.shortcut = nn.Identity() if same else nn.Sequential(_conv(before, after, 1, stride), _norm(after))
 
     def forward(self, x: Float[Tensor, "B before h w"]) -> Float[Tensor, "B after h2 w2"]:
-        """Features of the same or half the height and width."""
+        """Return features of the same or half the height and width."""
         y = self.first(functional.silu(self.norms[0](x)))
         y = self.second(functional.silu(self.norms[1](y)))
         return functional.silu(self.shortcut(x) + self.excitation(y))
@@ -123,7 +123,7 @@ class DecoderCell(nn.Module):
         self.shortcut = nn.Identity() if same else nn.Sequential(_conv(before, after, 1), _norm(after))
 
     def forward(self, x: Float[Tensor, "B before h w"]) -> Float[Tensor, "B after h2 w2"]:
-        """Features of the same or twice the height and width."""
+        """Return features of the same or twice the height and width."""
         if self.grows:
             x = functional.interpolate(x, scale_factor=2, mode="nearest")
         y = self.widen(self.norms[0](x))
@@ -150,7 +150,7 @@ class Gaussian(NamedTuple):
     logvar: Float[Tensor, "*batch z"]
 
     def sample(self, generator: torch.Generator | None) -> Float[Tensor, "*batch z"]:
-        """A draw that gradients pass through.
+        """Draw from the distribution; gradients pass through.
 
         Args:
             generator: draws it, on the device of the mean.
@@ -160,7 +160,7 @@ class Gaussian(NamedTuple):
 
 
 def kl_divergence(p: Gaussian, q: Gaussian) -> Float[Tensor, "*batch"]:
-    """KL(p || q) in closed form, summed over the components.
+    """Return KL(p || q) in closed form, summed over the components.
 
         sum_i (ln s_q^2 - ln s_p^2 + (s_p^2 + (m_p - m_q)^2) / s_q^2 - 1) / 2
 
@@ -189,7 +189,7 @@ class Recurrence(nn.Module):
     def forward(
         self, x: Float[Tensor, "B T inputs"], state: State | None = None
     ) -> tuple[Float[Tensor, "B T hidden"], State]:
-        """Outputs of the last layer, and the state after the last step; without a state it begins with zeros."""
+        """Return outputs of the last layer, and the state after the last step; without a state it begins with zeros."""
         return self.lstm(self.embedding(x), state)
 
 
@@ -208,7 +208,7 @@ class LatentLSTM(nn.Module):
         self.mean, self.logvar = nn.Linear(hidden, latent), nn.Linear(hidden, latent)
 
     def forward(self, x: Float[Tensor, "B T inputs"], state: State | None = None) -> tuple[Gaussian, State]:
-        """Gaussians (B, T, z), and the state to go on from."""
+        """Return Gaussians (B, T, z), and the state to go on from."""
         y, after = self.recurrence(x, state)
         return Gaussian(self.mean(y), self.logvar(y)), after
 
@@ -229,7 +229,7 @@ class FrameLSTM(nn.Module):
     def forward(
         self, x: Float[Tensor, "B T inputs"], state: State | None = None
     ) -> tuple[Float[Tensor, "B T g"], State]:
-        """Vectors in (0, 1), and the state to go on from."""
+        """Return vectors in (0, 1), and the state to go on from."""
         y, after = self.recurrence(x, state)
         return self.head(y).sigmoid(), after
 
@@ -269,7 +269,7 @@ class Encoder(nn.Module):
         self.head = nn.Linear(before, features)
 
     def forward(self, frames: Float[Tensor, "B 3 h w"]) -> tuple[Float[Tensor, "B g"], list[Float[Tensor, "B _ _ _"]]]:
-        """The vector of each frame, and the features after each cell."""
+        """Return the vector of each frame, and the features after each cell."""
         # With colours last in memory, 1 x 1 convolutions of few channels at stride 2 crash PyTorch 2.13.
         skips, x = [], frames.contiguous()
         for cell in self.cells:
@@ -305,7 +305,7 @@ class Decoder(nn.Module):
     def forward(
         self, vectors: Float[Tensor, "B g"], skips: Skips, known: Float[Tensor, "_ 3 h w"]
     ) -> Float[Tensor, "B 3 h w"]:
-        """Frames in [0, 1].
+        """Return frames in [0, 1].
 
         Args:
             vectors: of frames.
@@ -326,7 +326,7 @@ _AT_ONCE = 32  # sequences: more would take memory and no less time
 
 @dataclass(frozen=True, slots=True)
 class FitVidSettings:
-    """How large a network is.
+    """Sizes of a network.
 
     Attributes:
         side: of its square images [px]: 8 times a power of two.
@@ -379,7 +379,7 @@ class FitVidModel(nn.Module):
     """The network.
 
     Attributes:
-        settings: how large it is.
+        settings: its sizes.
         precision: what encoder and decoder compute in; parameters and frames are float32 in any case.
     """
 
@@ -419,7 +419,7 @@ class FitVidModel(nn.Module):
         actions: Float[Tensor, "B T 3"],
         generator: torch.Generator | None,
     ) -> Losses:
-        """How well each frame but the first is predicted from the true ones before it.
+        """Return the losses of predicting each frame but the first from the true ones before it.
 
         Args:
             frames: in [0, 1], three at least.
@@ -440,25 +440,19 @@ class FitVidModel(nn.Module):
         squared_error = (predicted - frames[:, 1:]).square().mean(dim=(0, 2, 3, 4)).sum()
         return Losses(squared_error, kl_divergence(posterior, prior).sum(dim=1).mean())
 
-    def rollout(
-        self,
-        context: Float[Tensor, "B 2 3 side side"],
-        actions: Float[Tensor, "B T1 3"],
-        generator: torch.Generator | None = None,
-    ) -> Iterator[Tensor]:
-        """The frames (B, 3, side, side) after the context, one after the other.
+    def rollout(self, context: Float[Tensor, "B 2 3 side side"], actions: Float[Tensor, "B T1 3"]) -> Iterator[Tensor]:
+        """Yield the frames (B, 3, side, side) after the context, one after the other; latents are the prior's means.
 
         Args:
             context: true frames in [0, 1].
             actions: the first one between the context's frames, then one for each frame that is predicted [m/s].
-            generator: draws latents from the prior; its mean is taken if None.
         """
         vectors, skips = self._context(context)
-        yield from self._continued(vectors, skips, context[:, -1], actions, generator)
+        yield from self._continued(vectors, skips, context[:, -1], actions)
 
     @torch.inference_mode()
     def _context(self, context: Float[Tensor, "B 2 3 side side"]) -> tuple[Float[Tensor, "B 2 g"], list[Tensor]]:
-        """Vectors of the context's frames, and the feature maps of the last ones."""
+        """Return vectors of the context's frames, and the feature maps of the last ones."""
         vectors, skips = self._encoded(context.flatten(0, 1))
         return vectors.unflatten(0, (-1, CONTEXT)), [skip[CONTEXT - 1 :: CONTEXT] for skip in skips]
 
@@ -468,15 +462,13 @@ class FitVidModel(nn.Module):
         skips: list[Tensor],
         known: Float[Tensor, "_ 3 side side"],
         actions: Float[Tensor, "B T1 3"],
-        generator: torch.Generator | None,
     ) -> Iterator[Tensor]:
         prior_state = frame_state = frame = None
         for step in range(actions.shape[1]):
             with torch.inference_mode():
                 vector = vectors[:, step] if frame is None else self._encoded(frame)[0]
                 prior, prior_state = self.prior(vector[:, None], prior_state)
-                latent = prior.mean if generator is None else prior.sample(generator)
-                inputs = [vector[:, None], actions[:, step : step + 1] / MAX_SPEED_M_S, latent]
+                inputs = [vector[:, None], actions[:, step : step + 1] / MAX_SPEED_M_S, prior.mean]
                 following, frame_state = self.frame_predictor(torch.cat(inputs, dim=-1), frame_state)
                 frame = self._decoded(following[:, 0], skips, known) if step + 1 >= CONTEXT else None
             if frame is not None:
@@ -488,16 +480,13 @@ class FitVidModel(nn.Module):
         actions: Float[np.ndarray, "K T 3"],
         *,
         between: Float[np.ndarray, "3"] | None = None,
-        generator: torch.Generator | None = None,
     ) -> Float32[np.ndarray, "K T h w 3"]:
-        """What will be seen after each action of each sequence.
+        """Predict what will be seen after each action of each sequence.
 
         Args:
             context_frames: what was seen one action ago, and now, in [0, 1].
             actions: sequences [m/s].
             between: the action between the context's frames [m/s]; standing still if None.
-            generator: draws a latent for each sequence and step, on this network's device; the prior's means are taken
-                if None, so that the same is predicted each time.
 
         Raises:
             InvalidInput: if the frames are of another size than the network's.
@@ -513,7 +502,7 @@ class FitVidModel(nn.Module):
         vectors, skips = self._context(context[None])  # once for all sequences
         parts = []
         for part in given.split(_AT_ONCE):
-            futures = self._continued(vectors.expand(len(part), -1, -1), skips, context[None, -1], part, generator)
+            futures = self._continued(vectors.expand(len(part), -1, -1), skips, context[None, -1], part)
             parts.append(torch.stack(list(futures), dim=1))
         return torch.cat(parts).movedim(2, -1).contiguous().cpu().numpy()
 
@@ -527,29 +516,25 @@ _SIZES = ("side", "width", "features", "hidden", "latent")
 
 
 def fitvid_path(data_dir: Path | None) -> Path:
-    """Where the network lies: DATA_DIR/fitvid.safetensors, else the package's."""
+    """Return the file of the network: DATA_DIR/fitvid.safetensors if it is there, else the package's."""
     own = None if data_dir is None else data_dir / _FILE
     shipped = Path(str(files("osfcore.experiments.rivals") / "shipped" / _FILE))
     return own if own is not None and own.is_file() else shipped
 
 
-def fitvid_bytes(model: FitVidModel) -> bytes:
-    """A network as the contents of a file; the statistics of batch norm keep their precision."""
+def write_fitvid(path: Path, model: FitVidModel) -> None:
+    """Write a network; the statistics of batch norm keep their precision. The file appears only when it is whole.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
     halved = {name for name, _ in model.named_parameters()}
     tensors = {
         name: (value.detach().half() if name in halved else value.detach()).cpu().contiguous()
         for name, value in model.state_dict().items()
     }
-    return save(tensors, {"format": FORMAT, **{name: str(value) for name, value in asdict(model.settings).items()}})
-
-
-def write_fitvid(path: Path, model: FitVidModel) -> None:
-    """Write a network; the file appears only when it is whole.
-
-    Raises:
-        CannotWrite: if the disk refuses.
-    """
-    write_atomically(path, fitvid_bytes(model))
+    sizes = {name: str(value) for name, value in asdict(model.settings).items()}
+    write_atomically(path, save(tensors, {"format": FORMAT, **sizes}))
 
 
 def read_fitvid(path: Path, precision: torch.dtype = torch.float32) -> FitVidModel:
@@ -557,7 +542,7 @@ def read_fitvid(path: Path, precision: torch.dtype = torch.float32) -> FitVidMod
 
     Args:
         path: of the file.
-        precision: what it shall compute in.
+        precision: of its computations.
 
     Raises:
         CorruptFile: if the file is missing, cut short, of another version or no such network.

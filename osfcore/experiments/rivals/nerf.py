@@ -56,15 +56,15 @@ class UnlitRenderer(SceneRenderer):
         outputs: frozenset[str] | set[str] = frozenset({"rgb"}),
         only: Bool[np.ndarray, "V h w"] | None = None,
     ) -> Rendered:
-        """Images of every scene of a batch from every camera; its lights play no part."""
+        """Render every scene of a batch from every camera; its lights play no part."""
         unlit = replace(quality, shadow_voxels=_NO_SHADOWS)
         return super().render(replace(batch, spots=None), cameras, quality=unlit, outputs=outputs, only=only)
 
 
 def mean_table(table: TableField) -> TableField:
-    """A table as bright under every light as it is on average over the hemisphere.
+    """Return a table that is as bright under every light as it is on average over the hemisphere.
 
-    That is what least squares finds for a table without light from images under lights that are uniform over the sky.
+    Least squares would find it for a table without light, from images under lights that are uniform over the sky.
     """
     z = (np.arange(_LIGHTS) + 0.5) / _LIGHTS  # equal areas of the hemisphere, along a spiral
     angle = np.pi * (1 + 5**0.5) * np.arange(_LIGHTS)
@@ -75,13 +75,13 @@ def mean_table(table: TableField) -> TableField:
 
 
 def nerf_library(data_dir: Path | None) -> FieldLibrary:
-    """Fields without light: DATA_DIR/nerf/fields/NAME/field.safetensors, and those of the package."""
+    """Return the fields without light: DATA_DIR/nerf/fields/NAME/field.safetensors, and those of the package."""
     shipped = Path(str(files("osfcore.experiments.rivals") / "shipped" / "nerf"))
     return FieldLibrary(None if data_dir is None else data_dir / _FOLDER, shipped=shipped)
 
 
 def load_nerf_appearance(names: Iterable[str], fields: FieldLibrary, data_dir: Path | None) -> ObjectModels:
-    """How objects and table look without light.
+    """Load objects and table that know of no light.
 
     Args:
         names: of the objects.
@@ -97,7 +97,7 @@ def load_nerf_appearance(names: Iterable[str], fields: FieldLibrary, data_dir: P
 
 
 def with_nerfs(models: SceneModels, fields: FieldLibrary, data_dir: Path | None) -> SceneModels:
-    """Models of which the appearance is that of fields without light.
+    """Replace the appearance of models by that of fields without light.
 
     Args:
         models: ours, of a scene's objects.

@@ -29,7 +29,7 @@ _STRETCH_M = 0.0025  # the pusher travels at most this far between two looks at 
 def push(
     table: ShapeTable, number: Int[Tensor, "B N"], motion: Motion, shifts: Float[Tensor, "S B 2"]
 ) -> Iterator[Motion]:
-    """The scenes after each of the pusher's displacements.
+    """Yield the scenes after each of the pusher's displacements.
 
     Args:
         table: shapes of objects.
@@ -37,7 +37,9 @@ def push(
         motion: the scenes at the start, in world coordinates; how they moved before plays no part.
         shifts: displacements of the pusher, one after the other [m].
     """
-    outline = _outlines(table, number, motion)
+    rotation = rotations.matrix(motion.quaternion.flatten(0, 1))
+    around = outlines(table, number.flatten(), rotation, torch.zeros_like(rotation[:, 0]))
+    outline = around.unflatten(0, number.shape)  # around the centres of mass
     arm = friction_arm(outline)
     for shift in shifts:
         parts = max(int(torch.ceil(shift.norm(dim=1).max() / _STRETCH_M)), 1)
@@ -46,14 +48,8 @@ def push(
         yield motion
 
 
-def _outlines(table: ShapeTable, number: Tensor, motion: Motion) -> Float[Tensor, "B N K 2"]:
-    """Outlines around the centres of mass."""
-    rotation = rotations.matrix(motion.quaternion.flatten(0, 1))
-    return outlines(table, number.flatten(), rotation, torch.zeros_like(rotation[:, 0])).unflatten(0, number.shape)
-
-
 def _stretch(motion: Motion, outline: Tensor, arm: Tensor, shift: Tensor) -> tuple[Motion, Tensor]:
-    """One short displacement of the pusher: first what it touches, then what these touch."""
+    """Move the pusher a short way: first what it touches gives way, then what these touch."""
     pusher = motion.pusher + shift
     radius = outline.square().sum(dim=-1).amax(dim=-1).sqrt()
     count = motion.centre.shape[1]
@@ -78,7 +74,7 @@ def _stretch(motion: Motion, outline: Tensor, arm: Tensor, shift: Tensor) -> tup
 def _shove(
     motion: Motion, outline: Tensor, arm: Tensor, pair: tuple[int, int], before: Tensor, pushed: Tensor, radius: Tensor
 ) -> tuple[Motion, Tensor]:
-    """Object j out of the way of a pushed object i; marks it as pushed."""
+    """Move object j out of the way of a pushed object i, and mark it as pushed."""
     i, j = pair
     offset = motion.centre[:, i, :2] - motion.centre[:, j, :2]
     meets = before[:, i] & ~before[:, j] & (offset.norm(dim=1) < radius[:, i] + radius[:, j])
@@ -97,7 +93,7 @@ def _shove(
 def _meeting(
     first: Float[Tensor, "B K 2"], second: Float[Tensor, "B K 2"], normal: Float[Tensor, "B 2"]
 ) -> Float[Tensor, "B 2"]:
-    """Middle of where the faces of two outlines meet, the normal pointing out of the first."""
+    """Return the middle of where the faces of two outlines meet, the normal pointing out of the first."""
     tangent = torch.stack([-normal[:, 1], normal[:, 0]], dim=1)
     ends = []
     for outline, out in ((first, normal), (second, -normal)):
@@ -112,7 +108,7 @@ def _meeting(
 def _moved(
     motion: Motion, outline: Tensor, place: tuple[Int[Tensor, "R"], int], way: Float[Tensor, "R 3"]
 ) -> tuple[Motion, Tensor]:
-    """One object of some scenes slid and turned."""
+    """Slide and turn one object of some scenes."""
     centre, quaternion, outline = motion.centre.clone(), motion.quaternion.clone(), outline.clone()
     centre[place] = centre[place] + functional.pad(way[:, :2], (0, 1))
     turn = functional.pad(way[:, 2:], (2, 0))

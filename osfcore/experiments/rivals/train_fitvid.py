@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -26,10 +26,10 @@ from torch.nn import functional
 
 from osfcore.dynamics.train import has_held_out_pair, is_for_validation
 from osfcore.errors import CorruptFile, InvalidInput, check_ranges, check_seed
-from osfcore.experiments.rivals.fitvid import CONTEXT, FitVidModel, FitVidSettings, fitvid_bytes
+from osfcore.experiments.rivals.fitvid import CONTEXT, FitVidModel, FitVidSettings, write_fitvid
 from osfcore.fields.devices import pick_device
 from osfcore.io.checkpoint import resume_from, write_checkpoint
-from osfcore.io.files import write_atomically, write_json
+from osfcore.io.files import write_json
 from osfcore.io.output_paths import check_weights_place
 from osfcore.metrics.image_errors import MOST_DB
 from osfcore.progress import Progress
@@ -53,7 +53,7 @@ Frames = Float[Tensor, "T 3 h w"]
 
 
 def augmented(videos: Float[Tensor, "B T 3 h w"], rng: np.random.Generator) -> Float[Tensor, "B T 3 h w"]:
-    """Each video with a crop and a change of colours of its own.
+    """Vary each video by a crop and a change of colours of its own.
 
     Args:
         videos: in [0, 1], square.
@@ -66,7 +66,7 @@ def augmented(videos: Float[Tensor, "B T 3 h w"], rng: np.random.Generator) -> F
 
 
 def _cropped(video: Frames, rng: np.random.Generator) -> Frames:
-    """A square of at least four fifths of the side, brought back to the video's size."""
+    """Cut out a square of at least four fifths of the side, and bring it back to the video's size."""
     full = video.shape[-1]
     side = int(rng.integers(round(LEAST_CROP * full), full + 1))
     top, left = rng.integers(full - side + 1, size=2)
@@ -75,56 +75,29 @@ def _cropped(video: Frames, rng: np.random.Generator) -> Frames:
 
 
 def _recoloured(video: Frames, rng: np.random.Generator) -> Frames:
-    change = _CHANGES[rng.integers(len(_CHANGES))]
-    return change(video, rng)
-
-
-def _blended(video: Frames, plain: Tensor, rng: np.random.Generator) -> Frames:
-    """Nearer to what it is blended with, or farther away."""
+    """Change one thing: colour, contrast, brightness, sharpness, the range of each colour, or the number of levels."""
+    match rng.integers(6):
+        case 0:
+            plain = _grey(video)
+        case 1:
+            plain = _grey(video).mean()
+        case 2:
+            plain = video.new_zeros(())
+        case 3:
+            kernel = video.new_tensor([[1, 1, 1], [1, 5, 1], [1, 1, 1]]) / 13
+            padded = functional.pad(video, (1, 1, 1, 1), mode="replicate")
+            plain = functional.conv2d(padded, kernel.expand(3, 1, 3, 3), groups=3)
+        case 4:  # each colour stretched so that it spans everything from 0 to 1
+            low, high = video.amin(dim=(0, 2, 3), keepdim=True), video.amax(dim=(0, 2, 3), keepdim=True)
+            return torch.where(high > low, (video - low) / (high - low).clamp(min=1e-6), video)
+        case _:
+            levels = 2 ** int(rng.integers(*_BITS)) - 1
+            return (video * levels).round() / levels
     return plain + (1 + rng.uniform(-_STRENGTH, _STRENGTH)) * (video - plain)
 
 
 def _grey(video: Frames) -> Float[Tensor, "T 1 h w"]:
     return (video * video.new_tensor(_GREY)[:, None, None]).sum(dim=1, keepdim=True)
-
-
-def _colour(video: Frames, rng: np.random.Generator) -> Frames:
-    return _blended(video, _grey(video), rng)
-
-
-def _contrast(video: Frames, rng: np.random.Generator) -> Frames:
-    return _blended(video, _grey(video).mean(), rng)
-
-
-def _brightness(video: Frames, rng: np.random.Generator) -> Frames:
-    return _blended(video, video.new_zeros(()), rng)
-
-
-def _sharpness(video: Frames, rng: np.random.Generator) -> Frames:
-    kernel = video.new_tensor([[1, 1, 1], [1, 5, 1], [1, 1, 1]]) / 13
-    padded = functional.pad(video, (1, 1, 1, 1), mode="replicate")
-    return _blended(video, functional.conv2d(padded, kernel.expand(3, 1, 3, 3), groups=3), rng)
-
-
-def _autocontrast(video: Frames, rng: np.random.Generator) -> Frames:
-    """Each colour stretched so that it spans everything from 0 to 1."""
-    low, high = video.amin(dim=(0, 2, 3), keepdim=True), video.amax(dim=(0, 2, 3), keepdim=True)
-    return torch.where(high > low, (video - low) / (high - low).clamp(min=1e-6), video)
-
-
-def _posterised(video: Frames, rng: np.random.Generator) -> Frames:
-    levels = 2 ** int(rng.integers(*_BITS)) - 1
-    return (video * levels).round() / levels
-
-
-_CHANGES: tuple[Callable[[Frames, np.random.Generator], Frames], ...] = (
-    _colour,
-    _contrast,
-    _brightness,
-    _sharpness,
-    _autocontrast,
-    _posterised,
-)
 
 
 # Frames and actions of recorded pushes, read window by window: thousands of videos need not fit into memory.
@@ -160,7 +133,7 @@ class Video(NamedTuple):
     steps: int
 
     def read(self, start: int, steps: int) -> tuple[UInt8[np.ndarray, "T1 h w 3"], Float32[np.ndarray, "T 3"]]:
-        """A stretch of the episode.
+        """Read a stretch of the episode.
 
         Raises:
             CorruptFile: if it cannot be read.
@@ -197,10 +170,10 @@ class VideoFiles:
     def __init__(self, paths: Sequence[Path]) -> None:
         self.learned: list[Video] = []
         self.held_out: list[Video] = []
-        sizes: dict[tuple[int, ...], Path] = {}
+        sizes: set[tuple[int, ...]] = set()
         with ExitStack() as opened:
             for path in paths:
-                self._sort(path, opened, sizes)
+                self._open(path, opened, sizes)
             if len(sizes) > 1:
                 raise InvalidInput("sizes of the frames [px]", [size[:2] for size in sizes], "the same in all files")
             for what, videos in (("learn from", self.learned), ("measure on", self.held_out)):
@@ -209,7 +182,8 @@ class VideoFiles:
             self._opened = opened.pop_all()
         self.side = next(iter(sizes))[0]
 
-    def _sort(self, path: Path, opened: ExitStack, sizes: dict[tuple[int, ...], Path]) -> None:
+    def _open(self, path: Path, opened: ExitStack, sizes: set[tuple[int, ...]]) -> None:
+        """Open a file, note the size of its frames and which of its episodes are held out."""
         try:
             file: Any = opened.enter_context(h5py.File(path))
             for number, (_, group) in enumerate(sorted(file.items())):
@@ -217,15 +191,15 @@ class VideoFiles:
                     raise CorruptFile(path, "it holds no frames: 'osf collect pushes --images' keeps them")
                 frames, steps = group["frames"], len(group["actions"])
                 _check_shapes(path, frames, group["actions"].shape)
-                sizes.setdefault(frames.shape[1:], path)
+                sizes.add(frames.shape[1:])
                 names = [name.decode() for name in group["names"][()].tolist()]
                 if is_for_validation(number):
                     self.held_out.append(Video(path, group, steps))
                 elif not has_held_out_pair(names):
                     self.learned.append(Video(path, group, steps))
+        except CorruptFile:
+            raise
         except _ERRORS as error:
-            if isinstance(error, CorruptFile):
-                raise
             raise CorruptFile(path, f"it is not a push file ({error})") from error
 
     def __enter__(self) -> VideoFiles:
@@ -235,7 +209,7 @@ class VideoFiles:
         self._opened.close()
 
     def drawn(self, rng: np.random.Generator, count: int, steps: int) -> Windows:
-        """Random stretches of random episodes to learn from.
+        """Draw random stretches of random episodes to learn from.
 
         Args:
             rng: draws them.
@@ -266,10 +240,10 @@ def _check_shapes(path: Path, frames: Any, actions: tuple[int, ...]) -> None:  #
 
 
 def windows(videos: Sequence[Video], starts: Int[np.ndarray, "B"], steps: int) -> Windows:
-    """Stretches of the same length.
+    """Read stretches of the same length.
 
     Args:
-        videos: episodes, as often as wanted.
+        videos: one episode for each stretch.
         starts: first action of each stretch.
         steps: actions in each.
 
@@ -300,7 +274,7 @@ class VideoErrors:
     copied: Float[np.ndarray, "N T"]
 
     def report(self) -> dict[str, Any]:
-        """Means over each horizon that the videos are long enough for, and by step, as plain JSON."""
+        """Return means over each horizon that the videos are long enough for, and by step, as plain JSON."""
         steps = self.predicted.shape[1]
         shown = [horizon for horizon in HORIZONS if horizon <= steps] or [steps]
         return {
@@ -310,7 +284,7 @@ class VideoErrors:
         }
 
     def _means(self, steps: slice) -> dict[str, float]:
-        """Means of errors, and of each frame's own PSNR [dB]."""
+        """Return means of errors, and of each frame's own PSNR [dB]."""
         report = {}
         for name, errors in (("", self.predicted[:, steps]), ("_copied", self.copied[:, steps])):
             psnr = np.minimum(-10 * np.log10(np.maximum(errors, 1e-12)), MOST_DB)
@@ -337,24 +311,25 @@ def measure(model: FitVidModel, videos: Sequence[Video]) -> Iterator[VideoErrors
         frames = as_frames(read.frames, device)
         futures = model.rollout(frames[:, :CONTEXT], torch.as_tensor(read.actions, device=device))
         last, truths = frames[:, CONTEXT - 1], frames[:, CONTEXT:].unbind(dim=1)
-        errors = [(_error(future, truth), _error(last, truth)) for future, truth in zip(futures, truths, strict=True)]
-        predicted.append(np.stack([ours for ours, _ in errors], axis=1))
-        copied.append(np.stack([theirs for _, theirs in errors], axis=1))
+        predicted.append(_errors(list(futures), truths))
+        copied.append(_errors([last] * len(truths), truths))
         yield VideoErrors(np.concatenate(predicted), np.concatenate(copied))
 
 
 def as_frames(frames: np.ndarray, device: torch.device) -> Float[Tensor, "B T 3 h w"]:
-    """Recorded 8-bit frames (B, T, h, w, 3) as the network takes them."""
+    """Return recorded 8-bit frames (B, T, h, w, 3) as the network takes them."""
     return torch.as_tensor(frames, device=device).movedim(-1, 2).float() / 255
 
 
-def _error(images: Tensor, truth: Tensor) -> Float[np.ndarray, "B"]:
-    return (images - truth).square().mean(dim=(1, 2, 3)).cpu().numpy().astype(float)
+def _errors(images: Sequence[Tensor], truths: Sequence[Tensor]) -> Float[np.ndarray, "B T"]:
+    """Return the mean squared error of each image of B videos at T steps."""
+    errors = [(image - truth).square().mean(dim=(1, 2, 3)) for image, truth in zip(images, truths, strict=True)]
+    return np.stack([error.cpu().numpy().astype(float) for error in errors], axis=1)
 
 
 _CLIP = 100.0
 _FALLING = 0.2  # of the budget
-_RECENT = 0.9  # of what is told as recent, kept from step to step
+_RECENT = 0.9  # share of running means that is kept from step to step
 _OWN_METRICS = ("parameters", "horizons")
 Precision = Literal["bfloat16", "float32"]
 
@@ -399,7 +374,7 @@ class TrainFitVid:
 
     @property
     def command(self) -> str:
-        """How to do it again."""
+        """The command that does it again."""
         parts = ["osf", "train", "fitvid", "--data", *(path.name for path in self.data), "--out", self.out.name]
         for field in fields(self):
             value = getattr(self, field.name)
@@ -471,19 +446,18 @@ class _Run:
 
     @property
     def share(self) -> float:
-        """Of the budget that is spent."""
+        """Share of the budget that is spent."""
         if self._config.iterations is not None:
             return self.steps / self._config.iterations
         return self._spent_s / (60 * self._config.minutes)
 
     def progress(self, note: str) -> Progress:
-        """In seconds, or in steps."""
-        config = self._config
-        total = config.iterations or max(1, round(60 * config.minutes))
+        """Return the progress in seconds, or in steps."""
+        total = self._config.iterations or max(1, round(60 * self._config.minutes))
         return Progress(min(round(self.share * total), total), total, note)
 
     def iterate(self) -> str:
-        """One step of descent. What is random in it depends on its number alone, not on the steps before it."""
+        """Do one step of descent. What is random in it depends on its number alone, not on the steps before it."""
         began, config = time.monotonic(), self._config
         rng = stream_rng(config.seed, Stream.VIDEO_WINDOWS, self.steps)
         window = self._videos.drawn(rng, config.batch, config.frames - 1)
@@ -494,13 +468,9 @@ class _Run:
         actions = torch.as_tensor(window.actions, device=self._device)
         losses = self._model.losses(frames, actions, latents)
         self._descend(losses.squared_error + config.beta * losses.kl)
-        still = (frames[:, CONTEXT:] - frames[:, CONTEXT - 1 : CONTEXT]).square().mean()
-        told = {
-            "error": float(losses.squared_error.detach()) / (config.frames - 1),
-            "kl": float(losses.kl.detach()) / (config.frames - 1),
-            "still": float(still),
-        }
-        for name, value in told.items():
+        error, kl = (float(loss.detach()) / (config.frames - 1) for loss in losses)
+        still = float((frames[:, CONTEXT:] - frames[:, CONTEXT - 1 : CONTEXT]).square().mean())
+        for name, value in {"error": error, "kl": kl, "still": still}.items():
             self._recent[name] = value + _RECENT * (self._recent.get(name, value) - value)
         self.steps += 1
         self._spent_s += time.monotonic() - began
@@ -526,15 +496,10 @@ class _Run:
         return repr((settings, self._videos.side, len(self._videos.learned)))
 
     def save(self) -> None:
-        """Everything that is needed to go on, also with a larger budget."""
-        content: dict[str, Any] = {
-            "model": self._model.state_dict(),
-            "adam": self._adam.state_dict(),
-            "steps": self.steps,
-            "spent_s": self._spent_s,
-            "recent": self._recent,
-        }
-        write_checkpoint(self._checkpoint, self._fingerprint(), content)
+        """Write everything that is needed to go on, also with a larger budget."""
+        content = {"model": self._model.state_dict(), "adam": self._adam.state_dict()}
+        numbers = {"steps": self.steps, "spent_s": self._spent_s, "recent": self._recent}
+        write_checkpoint(self._checkpoint, self._fingerprint(), {**content, **numbers})
 
     def resume(self) -> None:
         """Go on from the checkpoint of the same run, if there is one."""
@@ -551,15 +516,15 @@ class _Run:
         errors = None
         for errors in measure(model, videos):
             yield self.progress(f"Measuring on held-out videos ({len(errors.predicted)} of {len(videos)})")
-        assert errors is not None
-        report, data = errors.report(), fitvid_bytes(model)
-        write_atomically(self._config.out, data)
+        assert errors is not None  # for the type checker: there are held-out videos
+        report = errors.report()
+        write_fitvid(self._config.out, model)
         own = {
             "command": self._config.command,
             "seed": self._config.seed,
             "data": [path.name for path in self._config.data],
             "parameters": model.parameter_count,
-            "bytes": len(data),
+            "bytes": self._config.out.stat().st_size,
             "minutes": round(self._spent_s / 60, 2),
             "iterations": self.steps,
             "episodes": len(self._videos.learned),
@@ -572,5 +537,5 @@ class _Run:
         write_json(self._config.out.with_suffix(".json"), {**own, **report})
         self._checkpoint.unlink(missing_ok=True)
         horizon, means = list(report["horizons"].items())[-1]
-        told = f"{means['psnr']:.1f} dB over {horizon} steps (copied: {means['psnr_copied']:.1f} dB)"
-        yield self.progress(f"held out: {told}")
+        copied = f"copied: {means['psnr_copied']:.1f} dB"
+        yield self.progress(f"held out: {means['psnr']:.1f} dB over {horizon} steps ({copied})")

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -35,8 +36,6 @@ from osfcore.geometry.workspace import MAX_SPEED_M_S
 from osfcore.metrics.success import RearrangementTask
 from osfcore.objects.asset_library import AssetLibrary
 
-_AXES = 2
-
 
 class FramePredictor(Protocol):
     """Predicts images; `osfcore.experiments.rivals.fitvid.FitVidModel` is one."""
@@ -48,7 +47,7 @@ class FramePredictor(Protocol):
         *,
         between: Float[np.ndarray, "3"] | None = None,
     ) -> Float[np.ndarray, "K T h w 3"]:
-        """What will be seen after each action.
+        """Predict what will be seen after each action.
 
         Args:
             context_frames: what was seen one action ago, and now.
@@ -60,7 +59,7 @@ class FramePredictor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ForesightSettings:
-    """How actions are planned.
+    """Settings of the planner.
 
     Attributes:
         samples: sequences of each round (K).
@@ -96,7 +95,7 @@ class ForesightSettings:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ForesightPlan:
-    """What was planned.
+    """Result of planning.
 
     Attributes:
         actions: the mean after the last round [m/s].
@@ -145,7 +144,7 @@ class VisualForesight:
     def plan(
         self, context: Float[np.ndarray, "2 h w 3"], between: Float[np.ndarray, "3"] | None, rng: np.random.Generator
     ) -> ForesightPlan:
-        """All rounds.
+        """Plan in all rounds.
 
         Args:
             context: what was seen one action ago, and now.
@@ -164,9 +163,9 @@ class VisualForesight:
         self._mean = np.concatenate([self._mean[1:], np.zeros((1, 3))])
 
     def _sampled(self, rng: np.random.Generator) -> Float[np.ndarray, "K T 3"]:
-        """The mean, and sequences around it: n_t = c n_t-1 + sqrt(1 - c^2) e_t."""
+        """Draw the mean, and sequences around it: n_t = c n_t-1 + sqrt(1 - c^2) e_t."""
         s = self.settings
-        fresh = rng.normal(0, s.noise_m_s, (s.horizon, s.samples, _AXES))
+        fresh = rng.normal(0, s.noise_m_s, (s.horizon, s.samples, 2))
         noise = fresh.copy()
         for step in range(1, s.horizon):
             noise[step] = s.smoothing * noise[step - 1] + np.sqrt(1 - s.smoothing**2) * fresh[step]
@@ -175,7 +174,7 @@ class VisualForesight:
         return (self._mean + velocities).clip(-MAX_SPEED_M_S, MAX_SPEED_M_S)
 
     def _costs(self, frames: Float[np.ndarray, "K T h w 3"]) -> Float[np.ndarray, "K"]:
-        """One sequence after the other: the difference of all at once would double the memory."""
+        """Return the cost of each sequence, one after the other: all differences at once would double the memory."""
         return np.array([((video - self._goal) ** 2).mean(axis=(1, 2, 3), dtype=float).sum() for video in frames])
 
 
@@ -188,7 +187,7 @@ def _weights(costs: Float[np.ndarray, "K"], temperature: float) -> Float[np.ndar
 def foresee(
     world: World, goal: GoalImage, planner: VisualForesight, steps: int, rng: np.random.Generator
 ) -> Iterator[Foreseen]:
-    """Push until all steps are done: images alone do not tell when the goal is reached.
+    """Push until all steps are done: images alone do not show when the goal is reached.
 
     Args:
         world: one of whose cameras is that of the goal image.
@@ -215,7 +214,7 @@ def foresee(
 
 
 def _view(world: World, goal: GoalImage) -> Float[np.ndarray, "h w 3"]:
-    """What the goal image's camera sees now."""
+    """Return what the goal image's camera sees now."""
     seen = world.observe()
     for camera, image in zip(seen.cameras, seen.images, strict=True):
         if camera.name == goal.camera.name and image.shape == goal.image.shape:
@@ -234,10 +233,10 @@ def run_visual_foresight(
     factor: Factor | None = None,
     size: int = 128,
 ) -> Iterator[Foreseen | Ended]:
-    """One rearrangement task, done by visual foresight; the last step is how it ended.
+    """Do one rearrangement task by visual foresight; the last step is how it ended.
 
     Args:
-        task: what is told of it is the goal image alone.
+        task: the method sees its goal image alone.
         assets: meshes, for the simulator.
         predictor: of the goal camera's images.
         settings: of the plans.
@@ -247,12 +246,9 @@ def run_visual_foresight(
         size: side of the images [px], the predictor's.
     """
     camera = goal_camera(size)
-    world = VariedWorld(assets, factor or Factor(), rng.spawn(1)[0], cameras=(camera,))
-    try:
+    with closing(VariedWorld(assets, factor or Factor(), rng.spawn(1)[0], cameras=(camera,))) as world:
         goal = world.goal_image(task.goal, camera)
         world.restore(task.start)
         yield from foresee(world, goal, VisualForesight(predictor, goal.image, settings), steps, rng)
         image = world.render((camera,), with_pusher=False).images[0]
         yield Ended(world.truth(), image, goal.image)
-    finally:
-        world.close()

@@ -17,7 +17,7 @@ from osfcore.geometry.states import EstimatedState
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.planning.costs import PoseGoal
 from tests.core.dynamics.conftest import shapes, table  # noqa: F401 - fixtures
-from tests.core.experiments.solids import write_fields
+from tests.support.solids import write_fields
 
 SYMMETRIES = {name: info.symmetry for name, info in CATALOGUE.items()}
 PAPER = np.full((16, 16, 3), 0.5)

@@ -31,16 +31,11 @@ def test_black_and_white_squares_appear_where_the_camera_sees_them():
     assert values[is_black].max() < values[~is_black].min()
 
 
-def test_errors_are_the_same_for_the_same_seed_and_blank_where_the_camera_was_refused():
-    known = [board_errors(2, np.random.default_rng(5), (320, 240)) for _ in range(2)]
-    np.testing.assert_array_equal(known[0].camera_m, known[1].camera_m)
-    assert [bool(refusal) for refusal in known[0].refusals] == np.isnan(known[0].rotation_rad).tolist()
-
-
-def test_an_unknown_focal_length_costs_distance():
-    known, unknown = (board_errors(3, np.random.default_rng(2), VGA, is_focal_known=k) for k in (True, False))
-    assert np.all(known.focal_share == 0)
-    assert 0 < np.nanmax(np.abs(unknown.focal_share)) < 0.02
+def test_an_unknown_focal_length_costs_distance_and_refused_views_have_no_errors():
+    known, unknown = (board_errors(2, np.random.default_rng(5), (320, 240), is_focal_known=k) for k in (True, False))
+    assert [bool(refusal) for refusal in known.refusals] == np.isnan(known.rotation_rad).tolist()
+    assert np.nanmax(np.abs(known.focal_share)) == 0
+    assert 0 < np.nanmax(np.abs(unknown.focal_share)) < 0.05
     assert np.nanmax(unknown.camera_m) > np.nanmax(known.camera_m)
 
 

@@ -14,7 +14,7 @@ from osfcore.experiments.dynamics_scores import (
 )
 from osfcore.geometry.poses import quaternion_exp
 from osfcore.objects.asset import Symmetry
-from tests.core.experiments.pushes import NAMES, STEPS, episode, shapes
+from tests.support.push_episodes import NAMES, STEPS, episode, shapes
 
 NONE = {name: Symmetry("none", reason="label") for name in NAMES}
 
@@ -22,8 +22,6 @@ NONE = {name: Symmetry("none", reason="label") for name in NAMES}
 def test_windows_hold_the_step_before_their_start_and_all_that_follows():
     windows = windows_of([episode(speed=0.01)])
     assert len(windows.names) == (STEPS - LONGEST) // 4 + 1
-    assert windows.positions.shape[1] == LONGEST + 2
-    assert windows.actions.shape[1] == LONGEST
     np.testing.assert_array_equal(windows.positions[0, 0], windows.positions[0, 1])  # nothing is known before
     np.testing.assert_allclose(np.diff(windows.positions[1, :, 0, 0]), 0.01, atol=1e-12)
     assert (windows.on_table == LONGEST).all()
@@ -45,9 +43,9 @@ def test_the_constant_pose_errs_by_the_whole_way(turn):
     for number, horizon in enumerate(HORIZONS):
         np.testing.assert_allclose(found.mm[number, :, 0], 10 * horizon, rtol=1e-9)
         np.testing.assert_allclose(found.deg[number, :, 0], np.rad2deg(turn * horizon), atol=1e-6)
-        np.testing.assert_allclose(found.way_mm[number], found.mm[number], atol=1e-9)
-    assert found.median(4) == pytest.approx(40)
-    assert found.median(4, deg=True) == pytest.approx(np.rad2deg(4 * turn), abs=1e-6)
+    np.testing.assert_allclose(found.of_moved(4), 40)
+    np.testing.assert_allclose(found.of_moved(4, deg=True), np.rad2deg(4 * turn), atol=1e-6)
+    assert len(found.of_moved(4, among=np.array([[False, True]]))) == 0
     assert (found.of_still(4) == 0).all()  # the second object
 
 
@@ -71,7 +69,7 @@ def test_the_truth_has_no_error_and_symmetric_turns_are_none():
     assert errors(windows, constant(windows), round_can).deg.max() < 1e-5
     brick = NONE | {NAMES[0]: Symmetry("discrete", ((0.0, 0.0, 0.0, 1.0),), reason="plain")}
     half_turned = Predicted(truth.positions, truth.quaternions.copy())
-    half_turned.quaternions[..., :, :] = quaternion_exp(np.array([0, 0, np.pi]))
+    half_turned.quaternions[:] = quaternion_exp(np.array([0, 0, np.pi]))
     still = windows_of([episode(speed=0.01)])
     assert errors(still, half_turned, brick).deg[:, :, 0].max() < 1e-5
     assert errors(still, half_turned, NONE).deg[:, :, 0].min() > 179

@@ -1,22 +1,23 @@
-"""Estimation: evaluation, parts, report, plots."""
-
 import json
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-import osfcore.experiments.estimation as module
-import osfcore.experiments.estimation as parts
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
+from osfcore.estimation.first_frame import FirstFrameConfig
+from osfcore.estimation.goal_image import GoalImageConfig
+from osfcore.estimation.tracking import TrackingConfig
 from osfcore.experiments.estimation import (
-    PARTS,
+    MOST_SHOWN,
     REPORT_FILE,
     VIEWS,
     EstimateReport,
+    EvaluateEstimate,
     TaskRunner,
     bad_failure,
     drift,
@@ -35,12 +36,24 @@ from osfcore.geometry.poses import rotate
 from osfcore.inspection.contact_sheet import Comparison
 from osfcore.io.json_codec import decode
 from osfcore.objects.asset_library import AssetLibrary
-from tests.core.experiments.oracle import SHIFT_M, Oracle
-from tests.core.experiments.quick import quick
-from tests.core.experiments.scores import frame, report, score, track
-from tests.core.experiments.solids import SOLIDS
+from tests.support.errors import about
+from tests.support.estimate_scores import frame, report, score, track
+from tests.support.oracle import SHIFT_M, Oracle
+from tests.support.solids import SOLIDS
 
-# Evaluation
+EFFORT = FirstFrameConfig(
+    starts=1, population=4, generations=1, joint_population=4, joint_generations=1, coarse_iterations=1,
+    fine_iterations=1,
+)  # fmt: skip
+TRACK = TrackingConfig(sweeps=1, population=4, generations=1)
+GOAL = GoalImageConfig(side=64, planar_iterations=1, free_iterations=1)
+LOST = replace(track([0.0]), position_mm=(), rotation_deg=(), absent=(), seconds=(), refused="no masks")
+
+
+def quick(out: Path, **settings) -> EvaluateEstimate:
+    """Two solids in small images, with hardly any search: what is found is not good."""
+    small = {"objects": 2, "names": SOLIDS, "steps": 2, "size": 32, "effort": EFFORT, "track": TRACK, "goal": GOAL}
+    return EvaluateEstimate(out, **{**small, **settings})
 
 
 def last(steps):
@@ -48,8 +61,10 @@ def last(steps):
     return step
 
 
-def refuse(*_args, **_more):
-    raise AssertionError("this was measured before")
+def done(piece):
+    """The result of a piece, kept or made now."""
+    *_, (result,) = results_of([piece])
+    return result
 
 
 @pytest.fixture
@@ -57,6 +72,14 @@ def oracle(monkeypatch):
     oracle = Oracle()
     oracle.install(monkeypatch)
     return oracle
+
+
+@pytest.fixture
+def runner(solids, library, tmp_path, oracle):
+    return TaskRunner(quick(tmp_path), SOLIDS, solids, library)
+
+
+# Evaluation
 
 
 @pytest.fixture(scope="module")
@@ -78,116 +101,85 @@ def test_everything_is_measured_and_reported(evaluated):
     assert result["position_mm_median"] == pytest.approx(1000 * SHIFT_M)
     assert result["rotation_deg_median"] == pytest.approx(0, abs=1e-5)
     assert result["light_deg_median"] == pytest.approx(0, abs=1e-5)
-    assert result["mean_position_std_mm"] == pytest.approx(1)
-    assert result["two_sigma_coverage"] == 1
+    assert result["two_sigma_coverage"] == result["mean_position_std_mm"] == pytest.approx(1)
     assert (result["track_episodes"], result["track_lost"], result["track_frac_1cm_5deg"]) == (2, 0, 1)
-    assert result["refine_hz"] > 0
-    assert {n: row["frac_1cm_5deg"] for n, row in result["by_views"].items()} == {"1": 1, "2": 1, "4": 1}
-    assert result["bad_cases"] == 10
     assert result["bad_confident_wrong"] == sum(row["confident_wrong"] for row in result["bad_by_kind"].values())
     assert result["bad_by_kind"]["wrong name"] == result["bad_by_kind"]["goal of other objects"]
     assert json.loads((config.folder / REPORT_FILE).read_text()) == result
-
-
-@pytest.mark.slow
-def test_pictures_lie_beside_the_results(evaluated):
-    config, _ = evaluated
     assert config.folder == config.out / "estimate" / "2-objects-seed-0"
     pictures = {path.name for path in config.folder.glob("*.png")}
     assert pictures == {"errors.png", "calibration.png", "track.png", "views.png", "failures_bad.png"}
-
-
-@pytest.mark.slow
-def test_progress_grows_and_only_the_last_step_reports(evaluated):
-    _, steps = evaluated
-    assert [step.done for step in steps] == list(range(23))
-    assert {step.total for step in steps} == {22}
+    assert [(step.done, step.total) for step in steps] == [(n, 22) for n in range(23)]
     assert [step.report is None for step in steps] == [True] * 22 + [False]
-    assert steps[3].note == "Tracks (2 of 2)"
 
 
 @pytest.mark.slow
-def test_what_was_measured_is_taken_over(evaluated, solids, library, oracle):
+def test_what_was_measured_is_taken_over_unless_circumstances_changed(evaluated, solids, library, oracle):
     config, steps = evaluated
     again = last(evaluate_estimate(config, solids, library))
     assert again.report.to_json() == steps[-1].report.to_json()
-    fewer = last(evaluate_estimate(replace(config, tasks=1, parts=("goal",), bad=0), solids, library)).report
+    config = replace(config, bad=0)
+    fewer = last(evaluate_estimate(replace(config, tasks=1, parts=("goal",)), solids, library)).report
     assert fewer.first == steps[-1].report.first[:1]
     assert fewer.goals == steps[-1].report.goals[:1]
     assert fewer.tracks is fewer.views is fewer.fixed_light is fewer.bad is None
     assert not oracle.asked
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("change", "asked"),
-    [
-        ({"tasks": 3}, 1),
-        ({"seed": 1}, 2),
-        ({"objects": 1}, 2),
-        ({"size": 32}, 2),
-        ({"effort": replace(quick(None).effort, generations=2)}, 2),
-    ],
-)
-def test_other_circumstances_are_measured_anew(evaluated, solids, library, oracle, change, asked):
-    config = replace(evaluated[0], parts=("first",), bad=0)
-    last(evaluate_estimate(replace(config, **change), solids, library))
-    assert len(oracle.asked) == asked
+    effort = replace(EFFORT, generations=2)
+    for change in ({"tasks": 3}, {"seed": 1}, {"objects": 1}, {"size": 48}, {"effort": effort}):
+        before = len(oracle.asked)
+        last(evaluate_estimate(replace(config, parts=("first",), **change), solids, library))
+        assert len(oracle.asked) - before == (1 if "tasks" in change else 2)
 
 
 def test_a_killed_evaluation_goes_on(solids, library, tmp_path, oracle):
-    config = quick(tmp_path, tasks=3, parts=("track",))
+    config = quick(tmp_path, tasks=2, parts=("track",), factors=("noise_2",))
     for step in evaluate_estimate(config, solids, library):
-        if step.done == 4:
+        if step.done == 3:
             break
-    assert [what for what, _ in oracle.asked] == ["first search 4"] * 3 + ["next"] * 2
-    report = last(evaluate_estimate(config, solids, library)).report
-    assert [what for what, _ in oracle.asked] == ["first search 4"] * 3 + ["next"] * 6
-    assert [frame.names for frame in report.first] == [names for _, names in oracle.asked[:3]]
-    assert all(len(track.seconds) == 2 for track in report.tracks)
+    assert [what for what, _ in oracle.asked] == ["first search 4"] * 2 + ["next"] * 2
+    found = last(evaluate_estimate(config, solids, library)).report
+    assert [what for what, _ in oracle.asked[4:]] == ["next"] * 2 + ["first search 4"] * 2
+    assert [frame.names for frame in found.first] == [names for _, names in oracle.asked[:2]]
+    assert all(len(track.seconds) == 2 for track in found.tracks)
+    assert found.to_json()["by_factor"]["noise_2"]["objects_total"] == 4
 
 
 @pytest.mark.slow
 def test_a_refused_first_frame_is_a_result_too(solids, library, tmp_path, oracle):
     oracle.refuses = 1
-    report = last(evaluate_estimate(quick(tmp_path, tasks=2), solids, library)).report
-    assert "masks" in report.first[0].refused
-    assert not report.first[1].refused
-    assert [bool(track.refused) for track in report.tracks] == [True, False]
-    assert [goal.refused != "" for task in report.goals for goal in task] == [True, True, False, False]
-    result = report.to_json()
+    found = last(evaluate_estimate(quick(tmp_path, tasks=2), solids, library)).report
+    assert [bool(frame.refused) for frame in found.first] == [True, False]
+    assert [bool(track.refused) for track in found.tracks] == [True, False]
+    assert [goal.refused != "" for task in found.goals for goal in task] == [True, True, False, False]
+    result = found.to_json()
     assert (result["frac_1cm_5deg"], result["track_lost"], result["first_refused"]) == (0.5, 1, 1)
     assert (quick(tmp_path).folder / "failures_first.png").exists()
-    again = last(evaluate_estimate(quick(tmp_path, tasks=2), solids, library)).report
-    assert again.to_json() == result
+    assert last(evaluate_estimate(quick(tmp_path, tasks=2), solids, library)).report.to_json() == result
 
 
-def test_what_cannot_be_measured_is_told_before_anything_is_done(solids, library, tmp_path, monkeypatch):
-    monkeypatch.setattr(parts, "warm_models", refuse)
+def test_what_cannot_be_measured_is_refused_before_anything_is_done(solids, library, tmp_path, oracle):
     config = quick(tmp_path / "out")
-    cases = [
-        (replace(config, names=("teapot",)), UnknownName, "teapot"),
-        (replace(config, tasks=0), InvalidInput, "number of tasks is 0"),
-        (replace(config, objects=9), InvalidInput, "objects in a scene is 9"),
-        (replace(config, objects=4), InvalidInput, "number of names is 3, but it must be 4 or more"),
-        (replace(config, seed=-1), InvalidInput, "seed"),
-        (replace(config, bad=-1), InvalidInput, "bad cases"),
-        (replace(config, bad=1, objects=3), InvalidInput, "4 or more"),
-        (replace(config, bad=1, objects=1), InvalidInput, "2 or more"),
-        (replace(config, parts=("second",)), InvalidInput, "first, track, goal, ablations"),
-        (replace(config, size=5), InvalidInput, "size"),
-    ]
-    for wrong, error, words in cases:
-        with pytest.raises(error, match=words):
-            next(evaluate_estimate(wrong, solids, library))
-    with pytest.raises(MissingAssets, match=SOLIDS[0]):
+    for change, error, what in (
+        ({"names": ("teapot",)}, UnknownName, "teapot"),
+        ({"factors": ("fog",)}, UnknownName, "fog"),
+        ({"objects": 9}, InvalidInput, "objects in a scene"),
+        ({"objects": 4}, InvalidInput, "number of names"),
+        ({"bad": -1}, InvalidInput, "bad cases"),
+        ({"bad": 1, "objects": 3}, InvalidInput, "number of names"),
+        ({"bad": 1, "objects": 1}, InvalidInput, "objects in a scene"),
+        ({"parts": ("second",)}, InvalidInput, "part"),
+    ):
+        with pytest.raises(error, check=about(what)):
+            next(evaluate_estimate(replace(config, **change), solids, library))
+    with pytest.raises(MissingAssets):
         next(evaluate_estimate(config, solids, AssetLibrary(tmp_path / "none")))
+    assert not oracle.asked
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
 def test_an_executor_changes_no_estimate(solids, library, tmp_path):
-    config = quick(tmp_path / "alone", tasks=1, objects=1, names=SOLIDS[:1], size=32, parts=("first",))
+    config = quick(tmp_path / "alone", tasks=1, objects=1, names=SOLIDS[:1], parts=("first",))
     alone = last(evaluate_estimate(config, solids, library)).report
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
         shared = last(evaluate_estimate(replace(config, out=tmp_path / "shared"), solids, library, executor)).report
@@ -198,20 +190,9 @@ def test_an_executor_changes_no_estimate(solids, library, tmp_path):
 # Parts
 
 
-def done(piece):
-    """The result of a piece, kept or made now."""
-    *_, (result,) = results_of([piece])
-    return result
-
-
-@pytest.fixture
-def runner(solids, library, tmp_path, oracle):
-    return TaskRunner(quick(tmp_path), SOLIDS, solids, library)
-
-
 @pytest.mark.slow
 def test_the_real_estimators_are_called_as_they_want_to_be(solids, library, tmp_path):
-    config = quick(tmp_path, objects=1, names=SOLIDS[:1], steps=1, size=32)
+    config = quick(tmp_path, objects=1, names=SOLIDS[:1], steps=1)
     runner = TaskRunner(config, SOLIDS[:1], solids, library)
     first = done(runner.first(0))
     score = decode(FrameScore, first.figures["score"], "score")
@@ -222,7 +203,6 @@ def test_the_real_estimators_are_called_as_they_want_to_be(solids, library, tmp_
     (goal,) = done(runner.goal(0, first)).figures["scores"]
     assert not goal["refused"]
     assert decode(FrameScore, done(runner.fixed_light(0)).figures["score"], "score").light_ratios == ()
-    assert [comparison.label for comparison in first.shown] == [f"camera {n}" for n in range(4)]
     assert np.abs(first.shown[0].ours.astype(int) - first.shown[0].truth).mean() < 20
 
 
@@ -241,23 +221,16 @@ def test_tracks_and_goals_begin_with_estimates_and_never_with_the_truth(runner, 
     assert [len(names) for names in goals["moved"]] == [1, 2]
     for prior in oracle.given[2:]:
         np.testing.assert_array_equal(prior.poses.position, start.poses.position)
-
-
-def test_another_first_estimate_makes_later_parts_stale(runner, oracle):
-    first = done(runner.first(0))
-    done(runner.track(0, first))
-    count = len(oracle.asked)
-    done(runner.track(0, first))
-    assert len(oracle.asked) == count
+    asked = len(oracle.asked)
     first.figures["state"]["objects"][0]["position"][0] += 0.001
-    done(runner.track(0, first))
-    assert len(oracle.asked) == count + 2
+    done(runner.track(0, first))  # another first estimate makes it stale
+    assert len(oracle.asked) == asked + 2
 
 
 def test_ablations_see_fewer_cameras_or_hold_the_light(runner, oracle):
     done(runner.fixed_light(0))
-    for views in VIEWS:
-        done(runner.few_views(0, views))
+    for cameras in VIEWS.values():
+        done(runner.first(0, cameras))
     assert [what for what, _ in oracle.asked] == ["first held 4", "first search 1", "first search 2"]
     one, other = (default_cameras()[n] for n in VIEWS[2])
     forward = [rotate(camera.T_world_camera.quaternion, np.array([0, 0, 1.0])) for camera in (one, other)]
@@ -274,51 +247,21 @@ def test_bad_cases_are_judged_by_what_is_there(runner, oracle):
     assert scores["goal of other objects"].is_confidently_wrong
     assert scores["swapped masks"].is_right  # the oracle sees through it
     assert [what for what, _ in oracle.asked].count("goal") == 2
-    before = len(oracle.asked)
-    done(runner.bad(0))
-    assert len(oracle.asked) == before
 
 
-def test_a_refused_bad_case_says_so(runner, oracle):
+def test_a_refused_bad_case_is_not_confidently_wrong(runner, oracle):
     oracle.refuses = 1
     score = decode(BadScore, done(runner.bad(0)).figures["score"], "score")
-    assert "masks" in score.refused
+    assert score.refused
     assert not score.is_confidently_wrong
-
-
-def test_parts_are_those_that_can_be_asked_for():
-    assert PARTS == ("first", "track", "goal", "ablations")
 
 
 # Report
 
 
-KEYS = {
-    "objects_total",
-    "frac_1cm_5deg",
-    "position_mm_median",
-    "rotation_deg_median",
-    "adds_mm_median",
-    "light_deg_median",
-    "first_s_median",
-    "refine_hz",
-    "track_lost",
-    "goal_frac_1cm_5deg",
-    "frac_1cm_5deg_fixed_light",
-    "two_sigma_coverage",
-    "mean_position_std_mm",
-    "flagged_good",
-    "flagged_bad",
-}
-
-
-def test_all_keys_are_there_and_hold_what_was_measured():
+def test_figures_follow_from_the_scores():
     found = json.loads(json.dumps(report().to_json(), allow_nan=False))
-    assert set(found) >= KEYS
-    assert (found["tasks"], found["objects_total"]) == (2, 4)
-    assert found["frac_1cm_5deg"] == 0.75
-    assert found["position_mm_median"] == 1.5
-    assert found["first_s_median"] == 2.0
+    assert (found["frac_1cm_5deg"], found["position_mm_median"], found["first_s_median"]) == (0.75, 1.5, 2)
     assert found["goal_frac_1cm_5deg"] == 7 / 8
     assert found["goal_frac_1cm_5deg_by_moved"] == {"1": 1.0, "2": 0.75}
     assert found["frac_1cm_5deg_fixed_light"] == found["fixed_light"]["frac_1cm_5deg"] == 0.5
@@ -328,19 +271,19 @@ def test_all_keys_are_there_and_hold_what_was_measured():
     assert found["two_sigma_coverage"] == found["two_sigma_coverage_light"] == 1.0  # the wrong frame's light is out
     assert (found["flagged_good"], found["flagged_bad"]) == (0.0, 1.0)
     assert (found["bad_cases"], found["bad_refused"], found["bad_confident_wrong"]) == (2, 1, 1)
+    boundless = EstimateReport((frame(score(std_mm=None), score(std_mm=3.0)),)).to_json()
+    assert boundless["mean_position_std_mm"] == pytest.approx(3.0)
 
 
 def test_what_was_not_measured_is_null_under_the_same_keys():
     bare = EstimateReport(report().first).to_json()
-    everything = report().to_json()
-    assert set(bare) == {key for key in everything if not key.startswith("bad_")}
-    assert bare["frac_1cm_5deg"] == 0.75
+    assert set(bare) == {key for key in report().to_json() if not key.startswith("bad_")}
     empty = ("refine_hz", "track_lost", "goal_frac_1cm_5deg", "frac_1cm_5deg_fixed_light", "by_views")
     assert {bare[key] for key in empty} == {None}
     assert bare["flagged_bad"] == 1.0  # of first frames alone
 
 
-def test_lost_tracks_are_episodes_and_those_that_began_wrong_are_told_apart():
+def test_lost_tracks_are_episodes_and_those_that_began_wrong_are_counted_apart():
     tracks = (
         track([0.0, 40.0, 40.0], [0.0, 50.0, 50.0]),
         track([40.0, 40.0, 40.0], [0.0, 0.0, 0.0], right=False),
@@ -351,104 +294,66 @@ def test_lost_tracks_are_episodes_and_those_that_began_wrong_are_told_apart():
     assert found["track_lost_from_wrong_start"] == 1
 
 
-def test_what_is_off_the_table_is_counted_and_left_out():
-    tracks = (track([1.0, 1.0, 1.0, 1.0, 1.0]), track([99.0] * 5, absent="off the table"))
-    found = replace(report(), tracks=tracks).to_json()
-    assert (found["track_off_table"], found["track_out_of_view"], found["track_lost"]) == (5, 0, 0)
-    assert found["track_frac_1cm_5deg"] == 1
-    assert found["drift_mm"]["5"] == 1.0
-
-
-def test_drift_is_the_median_over_objects_at_a_step():
+def test_drift_is_the_median_over_visible_objects_at_a_step():
     tracks = [track([float(step) for step in range(20)], [float(step) + 2 for step in range(20)], rotation=3.0)]
     assert drift(tracks, 0) == {"5": 5.0, "10": 10.0, "15": 15.0, "20": 20.0}
     assert set(drift(tracks, 1).values()) == {3.0}
     assert drift([track([1.0])], 0) == {"5": None, "10": None, "15": None, "20": None}
+    tracks = (track([1.0, 1.0, 1.0, 1.0, 1.0]), track([99.0] * 5, absent="off the table"))
+    found = replace(report(), tracks=tracks).to_json()
+    assert (found["track_off_table"], found["track_out_of_view"], found["track_lost"]) == (5, 0, 0)
+    assert found["track_frac_1cm_5deg"] == found["drift_mm"]["5"] == 1
 
 
-def test_refusals_count_everywhere():
+def test_refusals_count_everywhere_and_can_be_drawn(tmp_path):
     refused = refused_frame(("can", "box"), "no masks", 0.5)
-    lost = replace(track([0.0]), position_mm=(), rotation_deg=(), absent=(), seconds=(), refused="no masks")
-    found = EstimateReport((refused,), (lost,), ((refused,),), (refused,), {1: (refused,), 2: (refused,)}).to_json()
+    nothing = EstimateReport((refused,), (LOST,), ((refused,),), (refused,), {1: (refused,), 2: (refused,)})
+    found = nothing.to_json()
     json.dumps(found, allow_nan=False)
     assert found["frac_1cm_5deg"] == found["goal_frac_1cm_5deg"] == 0
     assert found["first_refused"] == found["goal_refused"] == found["track_lost"] == 1
     assert found["position_mm_median"] is found["refine_hz"] is found["two_sigma_coverage"] is None
+    write_plots(tmp_path / "all", nothing)
+    assert {path.stem for path in (tmp_path / "all").iterdir()} == {"errors", "calibration", "track", "views"}
+    write_plots(tmp_path / "first", EstimateReport((refused,)))
+    assert {path.stem for path in (tmp_path / "first").iterdir()} == {"errors", "calibration"}
 
 
-def test_a_boundless_deviation_does_not_spoil_the_mean():
-    found = EstimateReport((frame(score(std_mm=None), score(std_mm=3.0)),)).to_json()
-    assert found["mean_position_std_mm"] == pytest.approx(3.0)
-
-
-# Plots
+# Galleries
 
 
 @pytest.fixture
 def shown():
-    images = np.random.default_rng(0).integers(0, 256, (4, 2, 32, 32, 3), dtype=np.uint8)
-    return tuple(Comparison(f"camera {k}", *pair) for k, pair in enumerate(images))
+    return (Comparison("camera 0", *np.zeros((2, 32, 32, 3), np.uint8)),)
 
 
-def test_there_are_curves_of_all_that_was_measured(tmp_path):
-    write_plots(tmp_path / "all", report())
-    names = {"errors.png", "calibration.png", "track.png", "views.png"}
-    assert {path.name for path in (tmp_path / "all").iterdir()} == names
-    for name in names:
-        assert cv2.imread(str(tmp_path / "all" / name)).shape[0] > 200
-    write_plots(tmp_path / "first", EstimateReport(report().first))
-    assert {path.name for path in (tmp_path / "first").iterdir()} == {"errors.png", "calibration.png"}
-
-
-def test_nothing_found_can_be_drawn_too(tmp_path):
-    refused = refused_frame(("a",), "no", 0.0)
-    lost = replace(track([0.0]), position_mm=(), rotation_deg=(), absent=(), seconds=(), refused="no")
-    write_plots(
-        tmp_path, EstimateReport((refused,), (lost,), ((refused,),), (refused,), {1: (refused,), 2: (refused,)})
-    )
-
-
-def test_right_and_trusted_frames_are_no_failures(shown):
+def test_failures_are_what_is_wrong_and_the_worst_come_without_a_warning(shown):
     assert frame_failure("task 0", frame(score(), score()), shown) is None
     warned = frame_failure("task 0", frame(score(flagged=True)), shown)
-    assert "right, flagged: it is hardly visible" in warned.lines[1]
-
-
-def test_wrong_ones_without_a_warning_come_first(shown):
-    told = frame_failure("task 1", frame(score(20.0, flagged=True), score(30.0, flagged=True)), shown)
-    untold = frame_failure("task 2", frame(score(), score(1.0, 170.0)), shown)
+    flagged = frame_failure("task 1", frame(score(20.0, flagged=True), score(30.0, flagged=True)), shown)
+    unflagged = frame_failure("task 2", frame(score(), score(1.0, 170.0)), shown)
     refused = frame_failure("task 3", refused_frame(("a",), "no masks", 0.0), shown)
-    assert refused.badness > untold.badness > told.badness
-    assert untold.lines[0].startswith("task 2, light off by 1.0 deg")
-    assert "1.0 mm, 170.0 deg WRONG, unflagged" in untold.lines[2]
-    assert refused.lines == ("task 3: REFUSED: no masks",)
+    assert refused.badness > unflagged.badness > flagged.badness > warned.badness
+    assert "no masks" in refused.lines[0]
 
 
-def test_lost_tracks_tell_when_and_from_what_start(shown):
+def test_lost_tracks_and_believed_bad_cases_are_failures(shown):
     assert track_failure("task 0", track([1.0] * 5), shown) is None
     lost = track_failure("task 0", track([1.0] * 5, [1.0, 1.0, 40.0, 40.0, 40.0], right=False), shown)
-    assert lost.lines[0] == "task 0, shown at step 4"
-    assert lost.lines[1] == "  b LOST at step 4: 40 mm, 0 deg, unflagged; first pose wrong"
-    assert "no start" in track_failure("task 0", replace(track([1.0]), refused="no masks"), shown).lines[0]
-
-
-def test_only_believed_bad_cases_are_failures(shown):
+    assert "step 4" in lost.lines[0]
+    assert len(lost.lines) == 2
+    assert track_failure("task 0", LOST, shown).badness > lost.badness
     wrong = BadScore(KINDS[3], "", "", False, (50.0, 1.0), (3.0, 4.0))
-    assert bad_failure("bad case 3", wrong, shown).lines == (
-        "bad case 3: black images: wrong without a warning (50 mm / 3 deg, 1 mm / 4 deg)",
-    )
-    for harmless in (replace(wrong, reason="too dark"), replace(wrong, refused="no"), replace(wrong, is_right=True)):
-        assert bad_failure("bad case 3", harmless, shown) is None
+    assert bad_failure("bad case 3", wrong, shown)
+    assert not bad_failure("bad case 3", replace(wrong, reason="too dark"), shown)
 
 
-def test_a_gallery_shows_the_worst_and_goes_when_nothing_fails(shown, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "MOST_SHOWN", 2)
+def test_a_gallery_shows_the_worst_and_goes_when_nothing_fails(shown, tmp_path):
     path = tmp_path / "failures.png"
     failure = frame_failure("task 1", frame(score(20.0)), shown)
     write_gallery(path, [failure])
     one = cv2.imread(str(path)).shape
-    write_gallery(path, [failure, None, failure, failure])
-    assert cv2.imread(str(path)).shape == (2 * one[0], one[1], 3)
+    write_gallery(path, [None, *[failure] * (MOST_SHOWN + 1)])
+    assert cv2.imread(str(path)).shape == (MOST_SHOWN * one[0], one[1], 3)
     write_gallery(path, [None])
-    write_gallery(path, [])
     assert not path.exists()

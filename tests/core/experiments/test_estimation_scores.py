@@ -3,8 +3,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from osfcore.experiments.estimation_scores import (
     FrameScore,
@@ -13,10 +11,8 @@ from osfcore.experiments.estimation_scores import (
     flagged_shares,
     flags,
     lost_at,
-    median,
     objects_of,
     pose_errors,
-    quantile,
     ratios_of,
     refused_frame,
     score_frame,
@@ -26,10 +22,9 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.io.json_codec import decode, encode
-from tests.core.experiments.scores import frame, score, track
+from tests.support.estimate_scores import frame, score, track
 
-BOX, CAN = "003_cracker_box", "005_tomato_soup_can"
-NAMES = (BOX, CAN)
+BOX, CAN = NAMES = ("003_cracker_box", "005_tomato_soup_can")
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +35,8 @@ def assets(library):
 @pytest.fixture
 def truth():
     rng = np.random.default_rng(1)
-    return SceneState(
-        NAMES, Pose(rng.normal(0, 0.1, (2, 3)), quaternion_exp(rng.normal(size=(2, 3)))), Light([0.3, 0.1, 0.9]), None
-    )
+    poses = Pose(rng.normal(0, 0.1, (2, 3)), quaternion_exp(rng.normal(size=(2, 3))))
+    return SceneState(NAMES, poses, Light([0.3, 0.1, 0.9]), None)
 
 
 def believed(truth, shift=(0, 0, 0), turn=(0, 0, 0), *, doubts=("", ""), reason="", std=0.001, light=None):
@@ -55,7 +49,8 @@ def believed(truth, shift=(0, 0, 0), turn=(0, 0, 0), *, doubts=("", ""), reason=
 
 
 def test_errors_are_what_was_done_to_the_truth(truth, assets):
-    found = score_frame(believed(truth, (0.003, 0, -0.004), (0, 0.06, 0)), truth, assets, 3.0)
+    estimate = believed(truth, (0.003, 0, -0.004), (0, 0.06, 0))
+    found = score_frame(estimate, truth, assets, 3.0)
     first, second = found.objects
     assert first.position_mm == pytest.approx(5)
     assert first.rotation_deg == pytest.approx(np.rad2deg(0.06))
@@ -66,15 +61,14 @@ def test_errors_are_what_was_done_to_the_truth(truth, assets):
     assert second.rotation_deg == pytest.approx(0, abs=1e-6)
     assert found.light_deg == pytest.approx(0, abs=1e-6)
     assert (found.seconds, found.trusted, found.is_right) == (3.0, True, True)
-    shift, turn = pose_errors(believed(truth, (0.003, 0, -0.004), (0, 0.06, 0)).state, truth, assets)
+    shift, turn = pose_errors(estimate.state, truth, assets)
     np.testing.assert_allclose(shift, [5, 0], atol=1e-12)
     np.testing.assert_allclose(turn, [np.rad2deg(0.06), 0], atol=1e-6)
 
 
 def test_the_order_of_objects_plays_no_part(truth, assets):
     estimate = believed(truth, (0.02, 0, 0))
-    state = estimate.state
-    swapped = replace(state, names=NAMES[::-1], poses=state.poses[::-1])
+    swapped = replace(estimate.state, names=NAMES[::-1], poses=estimate.state.poses[::-1])
     found = score_frame(replace(estimate, state=swapped), truth, assets, 0.0, ("", "out of view"))
     assert [(o.name, round(o.position_mm), o.absent) for o in found.objects] == [(CAN, 0, "out of view"), (BOX, 20, "")]
 
@@ -97,17 +91,8 @@ def test_boundless_and_vanishing_deviations_stay_plain_numbers(truth, assets):
 
 def test_scores_survive_json(truth, assets):
     found = score_frame(believed(truth, (0.003, 0, 0), doubts=("why", ""), reason="why"), truth, assets, 1.5)
-    assert decode(FrameScore, json.loads(json.dumps(encode(found))), "score") == found
-    refused = refused_frame(NAMES, "no masks", 0.1)
-    assert decode(FrameScore, json.loads(json.dumps(encode(refused))), "score") == refused
-    kept = track([1.0, 40.0], [1.0, 2.0])
-    assert decode(TrackScore, json.loads(json.dumps(encode(kept))), "score") == kept
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_coverage_of_gaussian_errors_is_that_of_two_deviations(seed):
-    errors = np.abs(np.random.default_rng(seed).normal(size=20_000))
-    assert coverage(errors) == pytest.approx(0.9545, abs=0.008)
+    for kind, one in ((FrameScore, found), (FrameScore, refused_frame(NAMES, "no", 0.1)), (TrackScore, track([1.0]))):
+        assert decode(kind, json.loads(json.dumps(encode(one))), "score") == one
 
 
 def test_coverage_looks_at_right_estimates_only():
@@ -121,48 +106,42 @@ def test_coverage_looks_at_right_estimates_only():
     assert coverage(found.position) == pytest.approx(2 / 3)
     assert coverage(found.pooled) == pytest.approx(4 / 8)
     assert coverage(()) is None
+    errors = np.abs(np.random.default_rng(0).normal(size=20_000))
+    assert coverage(errors) == pytest.approx(0.9545, abs=0.008)
 
 
-def test_a_refused_frame_counts_as_wrong_in_shares_and_not_in_medians():
+def test_a_refused_frame_counts_as_wrong_in_shares():
     frames = [frame(score(), score(position_mm=10.0), score(rotation_deg=5.0)), refused_frame(("a",), "no", 0.0)]
     assert share_right(frames) == pytest.approx(1 / 4)
     assert len(objects_of(frames)) == 3
     assert not frames[1].is_right
-    assert median(f.light_deg for f in frames) == 1.0
-    assert share_right([]) is median([]) is quantile([], 0.5) is None
+    assert share_right([]) is None
 
 
-def test_flags_are_counted_apart_for_right_and_wrong_estimates():
+def test_flags_are_counted_apart_for_right_and_wrong_estimates(truth):
     right = [score(flagged=True), score(), score(), score()]
     wrong = [score(position_mm=20, flagged=True), score(rotation_deg=90)]
     assert flagged_shares([frame(*right), frame(*wrong)]) == (0.25, 0.5)
     assert flagged_shares([frame(*right)]) == (0.25, None)
-
-
-def test_a_doubt_about_the_whole_is_one_about_every_object_unless_some_is_named(truth):
     assert flags(believed(truth)) == (False, False)
     assert flags(believed(truth, doubts=("why", ""), reason="why")) == (True, False)
-    assert flags(believed(truth, reason="too dark")) == (True, True)
+    assert flags(believed(truth, reason="too dark")) == (True, True)  # a doubt about the whole
 
 
 @pytest.mark.parametrize(
     ("position", "rotation", "absent", "expected"),
     [
-        ([0, 40, 0, 40, 0], [0] * 5, "", None),
-        ([0, 31, 31, 0, 0], [0] * 5, "", 2),
-        ([30] * 5, [20] * 5, "", None),  # not over
-        ([0, 40, 0, 0, 0], [0, 0, 21, 0, 0], "", 2),  # one way or the other
-        ([40] * 5, [0] * 5, "", 1),
-        ([0, 0, 0, 0, 40], [0] * 5, "", None),  # once only
-        ([40] * 5, [0] * 5, "off the table", None),
+        ([0, 40, 0, 40, 0], [0] * 5, [""] * 5, None),
+        ([0, 31, 31, 0, 0], [0] * 5, [""] * 5, 2),
+        ([30] * 5, [20] * 5, [""] * 5, None),  # not over
+        ([0, 40, 0, 0, 0], [0, 0, 21, 0, 0], [""] * 5, 2),  # one way or the other
+        ([0, 0, 0, 0, 40], [0] * 5, [""] * 5, None),  # once only
+        ([40] * 5, [0] * 5, ["off the table"] * 5, None),
+        ([40] * 5, [0] * 5, ["", "out of view", "", "", ""], 3),
     ],
 )
 def test_a_track_is_lost_when_it_is_far_off_for_two_steps_running(position, rotation, absent, expected):
-    assert lost_at(position, rotation, [absent] * 5) == expected
-
-
-def test_an_absence_interrupts_the_run():
-    assert lost_at([40, 40, 40, 40], [0] * 4, ["", "out of view", "", ""]) == 3
+    assert lost_at(position, rotation, absent) == expected
 
 
 def test_each_object_is_lost_by_itself():

@@ -1,37 +1,36 @@
-"""Harness: pieces, task cache, statistics."""
-
 import os
-from concurrent.futures import ProcessPoolExecutor
+import shutil
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from osfcore.errors import CannotWrite, CorruptFile, WorkerDied
+from osfcore.errors import CorruptFile, InvalidInput, MissingAssets, UnknownName, WorkerDied
 from osfcore.experiments.harness import (
     Piece,
     TaskCache,
     TaskResult,
-    compare_means,
-    compare_shares,
+    check_run,
+    chosen_objects,
     file_sha256,
-    holm,
-    mean_interval,
+    measurable,
     results_of,
-    share_interval,
+    scene_circumstances,
     table_sha256,
 )
+from osfcore.fields.field_library import FieldLibrary
 from osfcore.inspection.contact_sheet import Comparison
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.tasks import draw_scene
 from tests.clusters import deadly, number_of
-from tests.core.experiments.solids import exact_table
+from tests.support.errors import about
+from tests.support.solids import SOLIDS, exact_table
 
-# Pieces
+CIRCUMSTANCES = {"weights": "abc", "size": 32, "light": (0.1, 0.2)}
 
 
 def pieces(folder, count=4, work=number_of, circumstances=None):
@@ -52,28 +51,26 @@ def threads(_: int) -> TaskResult:
     return TaskResult({"number": torch.get_num_threads()}, number_of(0).shown)
 
 
-def test_pieces_are_done_in_turn_and_told_in_their_order(tmp_path):
-    assert [numbers(results) for results in results_of(pieces(tmp_path, 2))] == [
-        [None, None], [0, None], [0, 1],
-    ]  # fmt: skip
+class Elsewhere:
+    """An executor that does its work at once."""
+
+    def submit(self, work, *arguments):
+        future = Future()
+        future.set_result(work(*arguments))
+        return future
 
 
-def test_what_was_done_is_not_done_again(tmp_path):
-    first = last(results_of(pieces(tmp_path, 2)))
-    again = list(results_of(pieces(tmp_path, 3)))
-    assert numbers(again[0]) == [0, 1, None]
-    assert [one.figures for one in again[-1][:2]] == [one.figures for one in first]
-    (stale, *_) = results_of(pieces(tmp_path, 3, circumstances={"seed": 1}))
-    assert numbers(stale) == [None] * 3
-
-
-def test_one_that_is_left_keeps_what_was_done(tmp_path):
-    steps = results_of(pieces(tmp_path))
-    next(steps)
-    next(steps)
+@pytest.mark.parametrize("executor", [None, Elsewhere()])
+def test_pieces_are_done_once_even_if_the_evaluation_is_left(tmp_path, executor):
+    steps = results_of(pieces(tmp_path), executor)
+    assert numbers(next(steps)) == [None] * 4
+    assert len([number for number in numbers(next(steps)) if number is not None]) == 1
     steps.close()
-    (there, *_) = results_of(pieces(tmp_path))
-    assert numbers(there) == [0, None, None, None]
+    begun = numbers(next(results_of(pieces(tmp_path))))
+    assert begun.count(None) == 3
+    assert numbers(last(results_of(pieces(tmp_path), executor))) == [0, 1, 2, 3]
+    assert [numbers(results) for results in results_of(pieces(tmp_path))] == [[0, 1, 2, 3]]
+    assert numbers(next(results_of(pieces(tmp_path, circumstances={"seed": 1})))) == [None] * 4
 
 
 def test_torch_has_one_thread_meanwhile(tmp_path):
@@ -91,26 +88,18 @@ def test_processes_do_them_and_the_results_are_kept_here(tmp_path):
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
         results = last(results_of(pieces(tmp_path), executor))
     assert numbers(results) == [0, 1, 2, 3]
-    assert os.getpid() not in {result.figures["process"] for result in results}
-    assert numbers(last(results_of(pieces(tmp_path)))) == [0, 1, 2, 3]
-    assert {result.figures["process"] for result in last(results_of(pieces(tmp_path)))} == {
-        result.figures["process"] for result in results
-    }
+    made_by = [result.figures["process"] for result in results]
+    assert os.getpid() not in made_by
+    assert [result.figures["process"] for result in last(results_of(pieces(tmp_path)))] == made_by
 
 
 @pytest.mark.slow
-def test_a_worker_that_dies_is_told_and_costs_nothing_that_was_done(tmp_path):
+def test_a_worker_that_dies_costs_nothing_that_was_done(tmp_path):
     begun = pieces(tmp_path, 2)
     last(results_of(begun))
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor, pytest.raises(WorkerDied):
         last(results_of([*begun, Piece("99", TaskCache(tmp_path), {}, partial(deadly, 9))], executor))
     assert numbers(last(results_of(begun))) == [0, 1]
-
-
-# Task cache
-
-
-CIRCUMSTANCES = {"weights": "abc", "size": 32, "light": (0.1, 0.2)}
 
 
 @pytest.fixture
@@ -120,20 +109,16 @@ def result():
     return TaskResult({"psnr": [31.25, None]}, tuple(Comparison(f"image {i}", *pixels[i]) for i in range(2)))
 
 
-def test_a_result_comes_back_as_it_was(tmp_path, result):
-    TaskCache(tmp_path / "new").write("task", CIRCUMSTANCES, result)
-    back = TaskCache(tmp_path / "new").read("task", CIRCUMSTANCES)
+def test_a_result_comes_back_as_it_was_under_the_same_circumstances(tmp_path, result):
+    cache = TaskCache(tmp_path / "new")
+    assert cache.read("task", CIRCUMSTANCES) is None
+    cache.write("task", CIRCUMSTANCES, result)
+    back = cache.read("task", CIRCUMSTANCES)
     assert back.figures == result.figures
     for mine, theirs in zip(back.shown, result.shown, strict=True):
         assert mine.label == theirs.label
         np.testing.assert_array_equal(mine.truth, theirs.truth)
         np.testing.assert_array_equal(mine.ours, theirs.ours)
-
-
-def test_another_task_and_other_circumstances_have_no_result(tmp_path, result):
-    cache = TaskCache(tmp_path)
-    assert cache.read("task", CIRCUMSTANCES) is None
-    cache.write("task", CIRCUMSTANCES, result)
     assert cache.read("other", CIRCUMSTANCES) is None
     assert cache.read("task", {**CIRCUMSTANCES, "weights": "abd"}) is None
     assert cache.read("task", {"weights": "abc"}) is None
@@ -154,105 +139,45 @@ def test_a_damaged_result_is_none(tmp_path, result, kind, content):
     assert cache.read("task", CIRCUMSTANCES) is not None
 
 
-def test_an_unwritable_place_is_told(result):
-    with pytest.raises(CannotWrite, match="/proc/results"):
-        TaskCache(Path("/proc/results")).write("task", CIRCUMSTANCES, result)
+def test_circumstances_follow_fields_and_meshes(solids, library, tmp_path):
+    draw = draw_scene(SOLIDS, 2, 0, 0)
+    assets = AssetLibrary(shutil.copytree(library.root, tmp_path / "objects"))
+    before = scene_circumstances(draw, solids, assets)
+    assert before == scene_circumstances(draw, solids, library)
+    asset = assets.load(draw.names[0])
+    assets.write(replace(asset, mesh=replace(asset.mesh, texture=asset.mesh.texture // 4)), "a test")
+    after = scene_circumstances(draw, solids, assets)
+    assert {key for key in before if before[key] != after[key]} == {"assets"}
+    assert scene_circumstances(draw, FieldLibrary(None), library)["weights"] != before["weights"]
 
 
-def test_digests_follow_the_content(tmp_path):
+def test_checksums_follow_the_content(tmp_path):
     (tmp_path / "a").write_bytes(b"abc")
     assert file_sha256(tmp_path / "a").startswith("ba7816bf")
-    with pytest.raises(CorruptFile, match="cannot be read"):
+    with pytest.raises(CorruptFile):
         file_sha256(tmp_path / "b")
     table = exact_table()
     assert table_sha256(table) == table_sha256(exact_table())
     assert table_sha256(replace(table, background=table.background * 2)) != table_sha256(table)
 
 
-# Statistics
+@pytest.mark.parametrize(
+    ("tasks", "seed", "steps", "size"), [(0, 0, 2, 32), (1, -1, 2, 32), (1, 0, 3, 32), (1, 0, 2, 5)]
+)
+def test_settings_out_of_range_are_refused(tasks, seed, steps, size):
+    check_run(1, 0, ("steps", 2, 1, 2), size=32)
+    with pytest.raises(InvalidInput):
+        check_run(tasks, seed, ("steps", steps, 1, 2), size=size)
 
 
-OUTCOMES = st.lists(st.tuples(st.booleans(), st.booleans()), min_size=2, max_size=30)
-
-
-def test_the_interval_of_a_share_is_wilsons():
-    # By Wilson (1927), with z = 1.96: (p + z^2/2n -+ z sqrt(p(1-p)/n + z^2/4n^2)) / (1 + z^2/n).
-    n, p, z = 20, 0.95, 1.959964
-    middle, half = p + z**2 / (2 * n), z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    expected = np.array([middle - half, middle + half]) / (1 + z**2 / n)
-    assert share_interval(19, 20) == pytest.approx(expected, abs=1e-6)
-
-
-@given(tasks=st.integers(1, 200), share=st.floats(0, 1))
-def test_a_share_lies_in_its_interval(tasks, share):
-    low, high = share_interval(round(share * tasks), tasks)
-    assert 0 <= low <= round(share * tasks) / tasks + 1e-9
-    assert round(share * tasks) / tasks - 1e-9 <= high <= 1
-
-
-def test_the_interval_of_a_mean_narrows_with_the_root_of_the_number():
-    values = np.random.default_rng(0).normal(5, 1, 1600)
-    widths = [np.ptp(mean_interval(values[:count])) for count in (100, 1600)]
-    assert widths[0] == pytest.approx(2 * 1.96 / 10, rel=0.25)
-    assert widths[0] / widths[1] == pytest.approx(4, rel=0.25)
-
-
-@pytest.mark.parametrize("values", [[3.0], [3.0, 3.0, 3.0]])
-def test_values_without_spread_have_no_interval(values):
-    assert mean_interval(values) is None
-    assert compare_means(values, [0.0] * len(values)) == {"difference": 3.0, "interval": None}
-
-
-@pytest.mark.parametrize(("only_one", "p"), [(5, 2 / 2**5), (6, 2 / 2**6), (0, 1.0)])
-def test_mcnemar_counts_tasks_in_which_one_alone_succeeds(only_one, p):
-    ours = [True] * (10 + only_one) + [False] * 10
-    others = [True] * 10 + [False] * (10 + only_one)
-    found = compare_shares(ours, others)
-    assert found["p"] == pytest.approx(p)
-    assert found["difference"] == pytest.approx(only_one / len(ours))
-
-
-@given(outcomes=OUTCOMES)
-def test_the_interval_of_a_difference_holds_it_and_is_never_without_width(outcomes):
-    ours, others = zip(*outcomes, strict=True)
-    found = compare_shares(ours, others)
-    low, high = found["interval"]
-    assert -1 <= low <= found["difference"] <= high <= 1
-    assert high - low > 0.05
-
-
-def test_without_correlation_the_interval_of_a_difference_adds_the_squares_of_both():
-    """Newcombe (1998), method 10, where one method always succeeds."""
-    ours, others = [True] * 20, [True] * 15 + [False] * 5
-    (low, _), (other_low, other_high) = share_interval(20, 20), share_interval(15, 20)
-    found = compare_shares(ours, others)["interval"]
-    assert found[0] == pytest.approx(0.25 - np.hypot(1 - low, other_high - 0.75))
-    assert found[1] == pytest.approx(0.25 + 0.75 - other_low)
-
-
-def test_tasks_that_are_hard_for_both_narrow_the_interval_of_their_difference():
-    ours = [True] * 10 + [False] * 10
-    alike, unlike = ours, [*ours[5:], *ours[:5]]
-    widths = [np.ptp(compare_shares(ours, others)["interval"]) for others in (alike, unlike)]
-    assert widths[0] < 0.7 * widths[1]
-
-
-def test_holm_corrects_for_the_number_of_tests():
-    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
-    assert holm([0.5, 0.9]) == [1.0, 1.0]
-    assert holm([]) == []
-
-
-@given(outcomes=OUTCOMES)
-def test_comparing_the_other_way_round_turns_the_sign(outcomes):
-    ours, others = zip(*outcomes, strict=True)
-    one, other = compare_shares(ours, others), compare_shares(others, ours)
-    assert one["difference"] == pytest.approx(-other["difference"])
-    assert one["p"] == pytest.approx(other["p"])
-
-
-def test_a_paired_difference_is_narrower_than_both_spreads():
-    rng = np.random.default_rng(1)
-    tasks = rng.normal(0, 10, 200)  # some are hard, some are easy, for both alike
-    low, high = compare_means(list(tasks + rng.normal(1, 0.1, 200)), list(tasks))["interval"]
-    assert 0.9 < low < 1 < high < 1.1
+def test_objects_need_a_field_and_a_mesh(solids, library, tmp_path):
+    assert chosen_objects(None, solids, library) == measurable(solids, library) == SOLIDS
+    assert chosen_objects((SOLIDS[2], SOLIDS[0], SOLIDS[2]), solids, library) == (SOLIDS[2], SOLIDS[0])
+    with pytest.raises(UnknownName, check=about("teapot")):
+        chosen_objects(("teapot",), solids, library)
+    bare = AssetLibrary(tmp_path / "none")
+    for names in (None, SOLIDS[:2]):
+        with pytest.raises(MissingAssets, check=about(SOLIDS[1])):
+            chosen_objects(names, solids, bare)
+    with pytest.raises(InvalidInput, check=about("fields")):
+        chosen_objects(None, FieldLibrary(None, shipped=tmp_path), library)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from app.cli.progress_bar import follow
 from app.cli.workers import worker_pool
 from app.storage.paths import default_data_dir
+from osfcore.extras import need
 
 if TYPE_CHECKING:
     from osfcore.fields.field_library import FieldLibrary
@@ -43,11 +44,10 @@ class Evaluation(ABC):
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what the evaluation's report does."""
-        from osfcore.experiments.charts import check_matplotlib
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.objects.asset_library import AssetLibrary
 
-        check_matplotlib()  # before hours of work
+        need("experiments", "This command")  # before hours of work
         fields, assets = FieldLibrary(self.data_dir), AssetLibrary(self.data_dir / "objects")
         with self._pool() as executor:
             last = follow(self._steps(fields, assets, executor))

@@ -60,7 +60,7 @@ class EvaluatePhotosCommand:
         last = follow(evaluate_photos(config, FieldLibrary(self.data_dir)))
         assert last is not None
         assert last.report is not None, "the last step brings the report"
-        report = last.report.to_json()
+        report = last.report
         if not self.json:
             _show(folder, report)
         return report
@@ -76,7 +76,7 @@ class EvaluatePhotosCommand:
         last = follow(evaluate_lamps(config, AssetLibrary(self.data_dir / "objects"), FieldLibrary(self.data_dir)))
         assert last is not None
         assert last.report is not None, "the last step brings the report"
-        report = last.report.to_json()
+        report = last.report
         if not self.json:
             _show_lamps(folder, report)
         return report

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from app.cli.progress_bar import follow
 from app.cli.workers import worker_pool
 from app.storage.paths import default_data_dir
+from osfcore.extras import need
 
 if TYPE_CHECKING:
     from osfcore.experiments.reproduction.sections import Scale
@@ -55,13 +56,12 @@ class ReproduceCommand:
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds all figures of the report."""
-        from osfcore.experiments.charts import check_matplotlib
         from osfcore.experiments.reproduction.reproduction import PAGE_FILE, PARTS, About, Reproduce, reproduce
         from osfcore.experiments.reproduction.sections import QUICK, Scale
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.objects.asset_library import AssetLibrary
 
-        check_matplotlib()  # before hours of work
+        need("experiments", "This command")  # before hours of work
         scale = self._changed(QUICK if self.quick else Scale())
         about = About(date.today().isoformat(), _machine(), _command(), self.seed, ())
         config = Reproduce(self.out, self.data_dir, about, scale, self.quick, self.only or PARTS, self.names)

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -37,8 +35,10 @@ def test_a_field_without_light_has_the_density_that_it_had():
     field = FieldLibrary(None).load(NAME)
     unlit = without_light(field)
     np.testing.assert_array_equal(field.density, unlit.density)
-    seen = SceneRenderer({NAME: unlit}, None).render(scenes(), (goal_camera(32),), outputs={"rgb", "depth"})
-    true = SceneRenderer({NAME: field}, None).render(scenes(), (goal_camera(32),), outputs={"rgb", "depth"})
+    seen, true = (
+        SceneRenderer({NAME: one}, None).render(scenes(), (goal_camera(32),), outputs={"rgb", "depth"})
+        for one in (unlit, field)
+    )
     np.testing.assert_allclose(seen.depth, true.depth, atol=1e-5)
     np.testing.assert_allclose(seen.rgb[1], seen.rgb[0], atol=1e-6)
 
@@ -53,18 +53,14 @@ def test_nothing_casts_a_shadow():
 
 def test_the_mean_table_is_the_mean_over_lights():
     table = FieldLibrary(None).load_table()
-    rng = np.random.default_rng(0)
-    lights = rng.normal(size=(20_000, 3))
+    lights = np.random.default_rng(0).normal(size=(20_000, 3))
     lights[:, 2] = np.abs(lights[:, 2])
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
-    mean = table.ambient + table.direct(lights).mean(axis=0)
     unlit = mean_table(table)
-    np.testing.assert_allclose(unlit.ambient, mean, atol=0.01)
+    np.testing.assert_allclose(unlit.ambient, table.ambient + table.direct(lights).mean(axis=0), atol=0.01)
     np.testing.assert_array_equal(unlit.direct(lights[:9]), 0)
-    assert replace(unlit, ambient=table.ambient, w2=table.w2, b2=table.b2).albedo is table.albedo
+    assert unlit.albedo is table.albedo
 
 
 def test_default_objects_have_such_fields():
-    library = nerf_library(None)
-    assert NAME in library.names()
-    assert library.info(NAME).metrics["psnr_full"] == pytest.approx(24, abs=5)
+    assert nerf_library(None).info(NAME).metrics["psnr_full"] == pytest.approx(24, abs=5)

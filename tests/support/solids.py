@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from osfcore.fields.field_library import FIELD_FILE, TABLE_NAME
-from osfcore.fields.kiloosf import write_field
+from osfcore.fields.field_library import FIELD_FILE, TABLE_NAME, FieldLibrary
+from osfcore.fields.kiloosf import without_light, write_field
 from osfcore.fields.table import TableField, write_table
 from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.workspace import TABLE_SIDE_M
@@ -62,3 +62,11 @@ def write_fields(data_dir: Path, library: AssetLibrary) -> None:
         write_field(path, solid(library.size_m(name) / 2, is_round="can" in name))
         path.with_suffix(".json").write_text('{"minutes": 1.5}')
     write_table(data_dir / "fields" / TABLE_NAME / FIELD_FILE, exact_table())
+
+
+def write_nerfs(data_dir: Path) -> None:
+    """Put the shipped fields of the three objects, made blind for light, into DATA_DIR/nerf/fields."""
+    for name in SOLIDS:
+        path = data_dir / "nerf" / "fields" / name / FIELD_FILE
+        path.parent.mkdir(parents=True)
+        write_field(path, without_light(FieldLibrary(None).load(name)))

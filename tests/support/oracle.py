@@ -1,4 +1,4 @@
-"""Estimators that know the truth, in the place of real ones: what they get and what comes of it can be told exactly."""
+"""Estimators that know the truth, in the place of real ones, so that their scores are known exactly."""
 
 import hashlib
 from dataclasses import replace
@@ -26,8 +26,8 @@ class Oracle:
         self.refuses = 0  # so many of the next first frames
         self._truths = {}
 
-    def install(self, patch) -> None:
-        """Put it in the estimators' place."""
+    def install(self, patch, module=parts) -> None:
+        """Put it in the place of the estimators that a module calls."""
         real = tasks.take_frame
 
         def take_frame(world, cameras, **more):
@@ -37,10 +37,12 @@ class Oracle:
 
         patch.setattr(tasks, "take_frame", take_frame)
         patch.setattr(tasks, "PUSHED_M", 0.0)  # few steps push nothing far
-        patch.setattr(parts, "estimate_first", self.first)
-        patch.setattr(parts, "estimate_next", self.next)
-        patch.setattr(parts, "estimate_goal", self.goal)
-        patch.setattr(parts, "warm_models", _cold_models)
+        own = {"estimate_first": self.first, "estimate_first_calibrated": self.first}
+        own |= {"estimate_next": self.next, "estimate_goal": self.goal}
+        if module is not tasks:
+            own["warm_models"] = _cold_models
+        for name in own.keys() & vars(module):
+            patch.setattr(module, name, own[name])
 
     def first(self, _models, observation, _rng, effort):
         if self.refuses:

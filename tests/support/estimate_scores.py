@@ -1,4 +1,4 @@
-"""Handmade scores, for what is computed and drawn from them."""
+"""Handmade scores, for figures and pictures that are made of them."""
 
 from osfcore.experiments.estimation import EstimateReport
 from osfcore.experiments.estimation_scores import FrameScore, ObjectScore, TrackScore
