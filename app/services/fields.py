@@ -34,6 +34,7 @@ class MissingFields(OsfError):
 
     def __init__(self, names: Collection[str]) -> None:
         super().__init__(f"There is no field yet for {', '.join(names)}; train one under Fields.")
+        self.names = tuple(names)
 
 
 class NoPublishedField(OsfError):

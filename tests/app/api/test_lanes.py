@@ -16,7 +16,7 @@ def test_a_lane_refuses_what_it_cannot_take_in_and_recovers():
     async def use():
         inside = [asyncio.ensure_future(lane.run(free.wait, 20)) for _ in range(5)]
         await asyncio.sleep(0)
-        with pytest.raises(ProcessBusy, match="too much to do"):
+        with pytest.raises(ProcessBusy):
             await lane.run(free.wait)
         free.set()
         assert await asyncio.gather(*inside) == [True] * 5

@@ -21,7 +21,8 @@ from osfcore.fields.train_several import train_several
 from osfcore.io.push_file import read_pushes
 from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 from tests.clusters import deadly, local_cluster, number_of, number_that_kills, training_that_dies
-from tests.core.fields.rendered_sets import QUICK, painted_ball, painted_block, write_object_set
+from tests.support.errors import about
+from tests.support.rendered_sets import QUICK, painted_ball, painted_block, write_object_set
 
 
 def test_one_worker_is_this_process():
@@ -58,7 +59,7 @@ def test_workers_end_with_a_killed_parent(tmp_path):
 
 @pytest.mark.parametrize("count", [0, -1, 257])
 def test_senseless_numbers_are_refused(count):
-    with pytest.raises(InvalidInput, match="number of workers"), worker_pool(count):
+    with pytest.raises(InvalidInput, check=about("number of workers")), worker_pool(count):
         pass
 
 
@@ -168,14 +169,14 @@ def test_a_field_is_ordered_from_a_cluster(cluster, sets, tmp_path, capsys):
 
 @pytest.mark.slow  # after all others: Dask does not replace a worker that dies while it is being started
 def test_work_that_kills_every_worker_is_told(cluster, tmp_path):
-    with pytest.raises(WorkerDied, match="worker process died"):
+    with pytest.raises(WorkerDied):
         results(worker_pool(1, cluster), pieces_of(tmp_path, [partial(deadly, 0)]))
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "tcp://127.0.0.1:99999999"])
 def test_an_address_where_nothing_answers_is_told(address):
     pool = worker_pool(2, address, answers_within_s=0.3)
-    with pytest.raises(InvalidInput, match="address of the cluster"), pool:
+    with pytest.raises(InvalidInput, check=about("address of the cluster")), pool:
         pass
 
 

@@ -8,6 +8,7 @@ from app.episodes.frames import COLUMNS, HEIGHT, TILE_PX, WIDTH, frame, part_of,
 from osfcore.errors import CannotWrite, CorruptFile, OsfError
 from osfcore.geometry.workspace import STEP_S
 from osfcore.io.image_file import to_uint8, write_png
+from tests.support.errors import about
 
 BAR_PX = HEIGHT // 2 - TILE_PX
 
@@ -107,7 +108,7 @@ def test_a_frame_of_another_size_makes_no_video(tmp_path, wrong):
 @pytest.mark.parametrize("folder", ["missing", "file"])
 def test_a_place_that_takes_nothing_is_told_in_one_sentence(tmp_path, capfd, folder, count):
     (tmp_path / "file").write_text("")
-    with pytest.raises(CannotWrite, match=r"video\.mp4 cannot be written: [\w ]+\.$"):
+    with pytest.raises(CannotWrite, check=about("video.mp4")):
         write_video(tmp_path / folder / "video.mp4", [flat(0)] * count)
     assert capfd.readouterr() == ("", "")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
@@ -136,7 +137,7 @@ def test_frames_come_back_by_number_one_at_a_time(tmp_path):
     frames = read_frames(tmp_path)
     assert next(frames).max() == 0
     (tmp_path / "002.png").unlink()  # the next one is read when it is asked for
-    with pytest.raises(CorruptFile, match=r"002\.png"):
+    with pytest.raises(CorruptFile, check=about("002.png")):
         next(frames)
     assert [picture.max() for picture in read_frames(tmp_path)] == [0, 10, 999 % 251, 1000 % 251]
     assert list(read_frames(tmp_path / "none")) == []
@@ -154,5 +155,5 @@ def test_what_is_no_frame_is_told(tmp_path, content):
         path.unlink()
     elif content != "small":
         path.write_bytes(content)
-    with pytest.raises(CorruptFile, match=r"000\.png cannot be used: it is no readable frame"):
+    with pytest.raises(CorruptFile, check=about("000.png")):
         read_frame(path)

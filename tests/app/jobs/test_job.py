@@ -5,6 +5,7 @@ import pytest
 
 from app.jobs.job import Job, State, WrongJobState, check_file_name, check_params, ended, job_fields, job_from_fields
 from osfcore.errors import InvalidInput, UnknownName
+from tests.support.errors import about
 
 
 def test_a_job_survives_json():
@@ -37,6 +38,6 @@ def test_orders_that_do_not_fit_say_so():
 
 @pytest.mark.parametrize("available", [0, 2])
 def test_more_objects_than_there_are_is_refused(available):
-    with pytest.raises(InvalidInput, match="number of objects"):
+    with pytest.raises(InvalidInput, check=about("number of objects")):
         check_params("collect_pushes", {"objects": 3}, str, available)
     check_params("collect_pushes", {"objects": 2}, str, 2)

@@ -25,6 +25,7 @@ from app.processes.process_server import Answer, InternalError, child_main
 from app.processes.request_queue import Request
 from osfcore.errors import OsfError, UnknownName
 from tests.app.conftest import until
+from tests.support.errors import about
 
 TABLE = {"images": 60, "size": 16, "seed": 0}
 
@@ -58,14 +59,14 @@ def test_steps_rise_to_the_end_and_files_are_there(start):
 
 def test_a_refusal_is_told_in_its_words(start):
     _, outcome, events, _ = start("collect_object", {**TABLE, "name": "teapot"})
-    with pytest.raises(UnknownName, match="teapot"):
+    with pytest.raises(UnknownName, check=about("teapot")):
         outcome.result(60)
     assert events == []
 
 
 def test_a_defect_is_told_without_a_traceback(start):
     _, outcome, _, _ = start("collect_table", {"sizes": 3})
-    with pytest.raises(InternalError, match=r"The job failed \(TypeError\)") as failure:
+    with pytest.raises(InternalError) as failure:
         outcome.result(60)
     assert "\n" not in str(failure.value)
 
@@ -128,7 +129,7 @@ def test_a_job_asks_for_what_it_wants_done_with_its_scene():
     assert [type(message) for message in sent] == [SceneCommand]
     assert sent[0].command == command
     control.take(Answer(sent[0].number + 1, error=UnknownName("scene", "s1", [])))
-    with pytest.raises(UnknownName, match="no scene"):
+    with pytest.raises(UnknownName, check=about("scene")):
         control.ask(command)
 
 

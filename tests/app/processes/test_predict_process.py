@@ -14,6 +14,7 @@ from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from tests.app.processes.conftest import BOX, SIZE_M
 from tests.app.processes.fields import write_box
+from tests.support.errors import about
 
 TOWARD = np.tile([0.3, 0.0, 0.0], (1, 6, 1))  # the pusher of `state` passes the box, whose half is 3 cm, at 12 cm
 
@@ -42,9 +43,9 @@ def test_what_nobody_waits_for_is_left_out(oracle, state):
 
 
 def test_refusals(oracle, state):
-    with pytest.raises(UnknownName, match="teapot"):
+    with pytest.raises(UnknownName, check=about("teapot")):
         oracle.answer(PredictPushes("a", SceneState(("teapot",), state.poses, state.light, state.pusher), TOWARD))
-    with pytest.raises(InvalidInput, match="action 0 of sequence 0"):
+    with pytest.raises(InvalidInput, check=about("action 0 of sequence 0")):
         oracle.answer(PredictPushes("a", state, 2 * TOWARD))
     with pytest.raises(TypeError):
         oracle.answer(DrawView("a", state, goal_camera(16), is_sharp=False))

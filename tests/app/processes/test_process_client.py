@@ -65,7 +65,7 @@ def test_one_that_freezes_in_the_middle_of_an_answer_is_replaced(echo, delay_s):
 def test_one_that_lives_but_answers_nobody_is_replaced(echo):
     client = echo(answer_s=0.5)
     hanging = client.process
-    with pytest.raises(ProcessHangs, match="did not answer within 0.5 s"):
+    with pytest.raises(ProcessHangs):
         client.call(60.0)
     assert client.call("again") == "again"
     assert client.process is not hanging

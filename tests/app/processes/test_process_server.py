@@ -20,7 +20,7 @@ def _grumble(command, _):
 
 def test_what_a_child_logs_is_logged_by_the_service(caplog):
     client = ProcessClient(grumbling_main, (), "grumbler")
-    with pytest.raises(InternalError, match="grumbler failed"):
+    with pytest.raises(InternalError):
         client.call("words")
     client.stop()
     told = [(record.name, record.levelname, record.getMessage()) for record in caplog.records]

@@ -20,6 +20,7 @@ from osfcore.metrics.image_errors import psnr
 from osfcore.world.imaging import TABLE_ALBEDO
 from tests.app.processes.conftest import ALBEDO, BOX, SIZE_M
 from tests.app.processes.fields import write_box
+from tests.support.errors import about
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +106,7 @@ def test_missing_and_broken_fields_are_told(fields_dir, state, tmp_path):
     order = DrawView("a", state, goal_camera(32), is_sharp=False)
     shutil.copytree(fields_dir / "fields" / "table", tmp_path / "fields" / "table")
     renderer = NeuralRenderer(FieldLibrary(tmp_path, shipped=tmp_path))
-    with pytest.raises(UnknownName, match=BOX):
+    with pytest.raises(UnknownName, check=about(BOX)):
         renderer.render(order)
     (tmp_path / "fields" / BOX).mkdir()
     (tmp_path / "fields" / BOX / "field.safetensors").write_bytes(b"nonsense")

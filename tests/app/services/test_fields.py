@@ -39,16 +39,16 @@ def test_what_was_trained_here_is_told_and_can_be_deleted(shelf, tmp_path):
 def test_what_is_shipped_stays(shelf, monkeypatch):
     shipped = FieldInfo("mug", "shipped", Path("mug.safetensors"), 7, {})
     monkeypatch.setattr(FieldLibrary, "info", lambda _library, _name: shipped)
-    with pytest.raises(ShippedField, match="mug is shipped"):
+    with pytest.raises(ShippedField):
         shelf.remove("mug")
 
 
 def test_a_method_is_refused_objects_without_its_fields(shelf, tmp_path):
     put(tmp_path, "mug")
     shelf.require(("mug",), "ours")
-    with pytest.raises(NoPublishedField, match="no field as published for mug"):
+    with pytest.raises(NoPublishedField):
         shelf.require(("mug", "006_mustard_bottle"), "paper")
-    with pytest.raises(MissingFields, match="no field yet for teapot"):
+    with pytest.raises(MissingFields):
         shelf.require(("mug", "teapot"), "paper")
     own = own_field_path("mug", tmp_path)
     own.parent.mkdir()

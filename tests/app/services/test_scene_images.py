@@ -5,6 +5,7 @@ import pytest
 from app.processes.messages.scene_messages import TakeImage
 from app.services.scene_images import ImageCache, SceneImages
 from osfcore.errors import OsfError, UnknownName
+from tests.support.errors import about
 
 SHOT = TakeImage("s", "0", 64)
 
@@ -92,7 +93,7 @@ def test_an_image_that_could_not_be_made_is_tried_again():
 
 def test_an_unknown_scene_is_told():
     async def play(stage, images):
-        with pytest.raises(UnknownName, match="t"):
+        with pytest.raises(UnknownName, check=about("t")):
             await images.image(TakeImage("t", "0", 64))
         assert stage.taken == 0
 

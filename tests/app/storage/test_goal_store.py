@@ -11,6 +11,7 @@ from app.storage.goal_store import IMAGE, GoalRecord, GoalStore, TooManyGoals, p
 from osfcore.errors import UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
+from tests.support.errors import about
 
 PNG = b"\x89PNG picture"
 POSES = (("box", Pose(np.array([0.1, 0.2, 0.3]), np.array([0.6, 0.8, 0, 0]))),)
@@ -54,7 +55,7 @@ def test_the_newest_comes_first(store):
 def test_there_is_an_end_to_what_is_kept(store, tmp_path):
     for name in "abc":
         store.keep(goal(name), PNG)
-    with pytest.raises(TooManyGoals, match="3 goals"):
+    with pytest.raises(TooManyGoals):
         store.keep(goal("d"), PNG)
     assert left(tmp_path) == ["a", "b", "c"]
     store.remove("b")
@@ -84,7 +85,7 @@ def test_a_goal_that_was_removed_is_gone_with_its_image(store, tmp_path):
     store.remove("a")
     assert left(tmp_path) == []
     for call in (store.get, store.remove):
-        with pytest.raises(UnknownName, match="no such goal"):
+        with pytest.raises(UnknownName, check=about("goal")):
             call("a")
 
 
@@ -109,7 +110,7 @@ def test_a_full_disk_is_told_and_leaves_nothing(store, tmp_path, monkeypatch, st
         return usual(path, *given, **named)
 
     monkeypatch.setattr(Path, step, full)
-    with pytest.raises(CannotStore, match="No space left"):
+    with pytest.raises(CannotStore):
         store.keep(goal("b"), PNG)
     monkeypatch.undo()
     assert left(tmp_path) == ["a"]
@@ -123,7 +124,7 @@ def test_a_goal_that_may_not_be_removed_stays(store, tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "rename", denied)
-    with pytest.raises(CannotStore, match="Permission denied"):
+    with pytest.raises(CannotStore):
         store.remove("a")
     monkeypatch.undo()
     assert (tmp_path / "goals" / "a" / IMAGE).read_bytes() == PNG

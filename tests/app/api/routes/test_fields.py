@@ -11,7 +11,7 @@ from tests.app.api.routes.test_jobs import finished
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import LONG, running, until
 from tests.app.services.test_image_sets import zipped
-from tests.core.fields.sets import write_set
+from tests.support.ellipsoid_sets import write_set
 
 GELATIN = "009_gelatin_box"
 ZIP = {"Content-Type": "application/zip"}

@@ -20,9 +20,9 @@ from osfcore.io.files import write_json
 from osfcore.io.scene_file import camera_to_json
 from osfcore.robots.robot import ConnectionLost
 from tests.app.conftest import running, until
-from tests.core.robots.robots import NAMES, example, noted, serving, simulated
-from tests.core.robots.ros_stand_in import StandIn
 from tests.live import free_port
+from tests.support.robots import NAMES, example, noted, serving, simulated
+from tests.support.ros_robots import StandIn
 
 PAGE = {"X-OSF-Visitor": "page"}
 GREY = 188  # in sRGB, half the radiance

@@ -7,6 +7,7 @@ from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import goal_camera
 from osfcore.io.scene_file import CameraJson
 from tests.app.storage.test_database import record
+from tests.support.errors import about
 
 
 def test_a_scene_says_what_the_record_says():
@@ -34,5 +35,5 @@ def test_unknown_fields_are_mistakes():
 
 
 def test_a_light_below_the_table_is_refused():
-    with pytest.raises(InvalidInput, match="elevation"):
+    with pytest.raises(InvalidInput, check=about("elevation")):
         LightIn(position=[1, 0, -0.1]).light()

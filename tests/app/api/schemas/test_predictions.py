@@ -8,6 +8,7 @@ from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.states import EstimatedState
 from osfcore.io.scene_file import Scene, estimated_to_json, scene_to_json
 from tests.app.storage.test_database import record
+from tests.support.errors import about
 
 STATE = record().state
 OBJECT = {"name": "a", "position": [0, 0, 0.1], "quaternion": [1, 0, 0, 0]}
@@ -38,7 +39,7 @@ def test_quaternions_are_unit(changed, words):
 
 
 def test_an_object_is_there_once():
-    with pytest.raises(InvalidInput, match="without repetition"):
+    with pytest.raises(InvalidInput, check=about("objects")):
         StateIn.model_validate({"objects": [OBJECT, OBJECT]}).state()
 
 

@@ -6,6 +6,7 @@ import tyro
 
 from app.cli.commands.assets import Assets, AssetsAdd, AssetsFetch, AssetsList
 from osfcore.errors import InvalidInput, UnknownName
+from tests.support.errors import about
 
 
 def parse(*arguments: str) -> Assets:
@@ -58,10 +59,10 @@ def test_add_shows_in_the_list(tmp_path, capsys):
 
 
 def test_bad_input_is_an_error_of_ours(tmp_path):
-    with pytest.raises(InvalidInput, match="source"):
+    with pytest.raises(InvalidInput, check=about("source")):
         AssetsFetch(source=str(tmp_path / "none"), data_dir=tmp_path).run()
-    with pytest.raises(InvalidInput, match="workers"):
+    with pytest.raises(InvalidInput, check=about("workers")):
         AssetsFetch(workers=0, data_dir=tmp_path).run()
-    with pytest.raises(UnknownName, match="nonsense"):
+    with pytest.raises(UnknownName, check=about("nonsense")):
         AssetsFetch(("nonsense",), data_dir=tmp_path).run()
     assert list(tmp_path.iterdir()) == []

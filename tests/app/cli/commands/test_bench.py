@@ -10,8 +10,8 @@ from app.cli.main import main
 from osfcore.experiments import bench_rollouts as bench_dynamics
 from osfcore.experiments.bench_estimation import BenchEstimate
 from osfcore.experiments.bench_rendering import BenchRender
-from tests.core.experiments.oracle import Oracle
-from tests.core.experiments.solids import write_fields
+from tests.support.oracle import Oracle
+from tests.support.solids import write_fields
 
 
 @pytest.fixture
@@ -46,10 +46,7 @@ def test_figures_are_the_last_line_as_json_and_a_file(fields_dir, tmp_path, caps
 def test_estimates_are_timed(data_dir, library, tmp_path, capsys, monkeypatch):
     write_fields(data_dir, library)
     oracle = Oracle()
-    oracle.install(monkeypatch)
-    for name in ("first", "next", "goal"):
-        monkeypatch.setattr(bench_estimate, f"estimate_{name}", getattr(oracle, name))
-    monkeypatch.setattr(bench_estimate, "warm_models", lambda *_: None)
+    oracle.install(monkeypatch, bench_estimate)
     monkeypatch.setattr(bench_estimate, "BenchEstimate", partial(BenchEstimate, objects=2, steps=2, size=32))
     arguments = ["bench", "estimate", "--data-dir", str(data_dir), "--scenes", "1"]
     assert main([*arguments, "--out", str(tmp_path / "out"), "--json"]) == 0

@@ -11,6 +11,7 @@ from app.cli.commands.collect import (
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.inspection.check import check_path
 from osfcore.io.push_file import read_pushes
+from tests.support.errors import about
 
 
 def test_object_images(data_dir, tmp_path):
@@ -47,7 +48,7 @@ def test_frames_of_the_goal_camera_go_along_with_pushes(data_dir, tmp_path):
 def test_mistakes_are_errors_of_ours(data_dir, tmp_path):
     with pytest.raises(UnknownName):
         CollectObjectCommand("teapot", tmp_path / "set", data_dir=data_dir).run()
-    with pytest.raises(InvalidInput, match="workers"):
+    with pytest.raises(InvalidInput, check=about("workers")):
         CollectPushesCommand(tmp_path / "a.h5", workers=0, data_dir=data_dir).run()
 
 

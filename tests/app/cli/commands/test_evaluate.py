@@ -18,8 +18,9 @@ from osfcore.experiments.estimation import EvaluateEstimate
 from osfcore.experiments.fields import EvaluateFields
 from osfcore.experiments.rearrangement_runs import Ended
 from osfcore.world.collect_images import CollectObject, collect_object
-from tests.core.experiments.oracle import Oracle
-from tests.core.experiments.solids import SOLIDS, write_fields
+from tests.support.errors import about
+from tests.support.oracle import Oracle
+from tests.support.solids import SOLIDS, write_fields
 
 
 @pytest.fixture
@@ -54,12 +55,12 @@ def test_any_set_and_weights(fields_dir, library, tmp_path):
     result = EvaluateFieldsCommand(tmp_path / "out", data=tmp_path / "set", weights=weights).run()
     assert set(result["objects"]) == {"set"}
     assert result["scene_psnr_mean"] is None
-    with pytest.raises(InvalidInput, match="both or none"):
+    with pytest.raises(InvalidInput):
         EvaluateFieldsCommand(tmp_path / "out", data=tmp_path / "set").run()
     table = fields_dir / "fields" / "table" / "field.safetensors"
-    with pytest.raises(CorruptFile, match="format"):
+    with pytest.raises(CorruptFile, check=about("format")):
         EvaluateFieldsCommand(tmp_path / "out", data=tmp_path / "set", weights=table).run()
-    with pytest.raises(CorruptFile, match="anno.json"):
+    with pytest.raises(CorruptFile, check=about("anno.json")):
         EvaluateFieldsCommand(tmp_path / "out", data=tmp_path, weights=weights).run()
 
 

@@ -17,8 +17,8 @@ from osfcore.io.observation_file import read_observation
 from osfcore.io.scene_file import Scene, scene_to_json
 from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
-from tests.core.export.test_splats import HALF, ellipsoid_field
-from tests.core.photo.bop_scenes import write_bop_scene
+from tests.support.bop_scenes import write_bop_scene
+from tests.support.ellipsoid import HALF, ellipsoid_field
 
 NAMES = ("003_cracker_box", "006_mustard_bottle")
 

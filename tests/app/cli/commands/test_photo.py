@@ -12,7 +12,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import quaternion_to_matrix, rotation_angle
 from osfcore.io.image_file import write_png
 from tests.app.cli.commands.photo_of_a_table import on_the_table, table_photo
-from tests.core.photo.conftest import INTRINSICS, NAME, take
+from tests.support.photographs import INTRINSICS, NAME, take
 
 FOCAL = str(INTRINSICS[0, 0])
 

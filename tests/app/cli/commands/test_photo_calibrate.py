@@ -11,7 +11,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import write_png
 from tests.app.cli.commands.photo_of_a_table import SIZE, K, on_the_table, table_photo
-from tests.core.photo.seen_boards import tilted
+from tests.support.boards import tilted
 
 TILTS = ((35, 0), (-35, 10), (0, 38), (5, -36))
 NAME = "009_gelatin_box"

@@ -71,7 +71,7 @@ def test_an_episode_becomes_a_film_of_full_size_that_every_browser_plays(library
 
 
 def test_of_an_episode_that_pushed_nothing_there_is_no_clip(library, trajectory, tmp_path):
-    with pytest.raises(NoClip, match="nothing to make a clip of"):
+    with pytest.raises(NoClip):
         list(clip_of(tmp_path, library, tmp_path / "clip.mp4"))
     (tmp_path / REPORT_FILE).write_text("{}")
     write_trajectory(tmp_path / TRAJECTORY_FILE, Trajectory(trajectory.states[:1], at(0.0), (), ()))

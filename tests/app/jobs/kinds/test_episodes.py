@@ -34,7 +34,8 @@ from osfcore.paper import stages
 from osfcore.paper.estimation import PaperEstimationConfig, estimate_first
 from osfcore.progress import Progress
 from tests.app.jobs.kinds.test_remote_world import NAMES, Stage, stage  # noqa: F401  a fixture
-from tests.core.control.scenes import perfect_fit, sure
+from tests.support.errors import about
+from tests.support.tabletop_scenes import perfect_fit, sure
 
 SMALL = {"steps": 3, "plan": {"samples": 16, "horizon": 6}}
 
@@ -219,7 +220,7 @@ def test_whoever_stops_it_leaves_its_steps_and_nothing_half_written(place, stage
 def test_settings_in_json_are_checked_like_any(stage):  # noqa: F811
     assert settings_of({}).steps == EpisodeSettings().steps
     assert settings_of(SMALL).plan.samples == 16
-    with pytest.raises(InvalidInput, match="horizon"):
+    with pytest.raises(InvalidInput, check=about("horizon")):
         settings_of({"plan": {"horizon": 0}})
 
 

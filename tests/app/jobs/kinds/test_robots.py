@@ -12,7 +12,7 @@ from app.processes.messages.job_messages import CancelJob, ChangeJob, JobCancell
 from osfcore.io.image_file import write_png
 from osfcore.robots.connect import connect
 from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped
-from tests.core.robots.robots import NAMES, example, serving, simulated, tell_truth, toward_middle, until
+from tests.support.robots import NAMES, example, serving, simulated, tell_truth, toward_middle, until
 
 
 class Driven:
@@ -65,7 +65,7 @@ def test_it_waits_for_permission_and_then_does_its_steps(robot, tmp_path):
     assert [step.done for step in job.steps][-1] == 2
     assert np.any(robot[1].truth().pusher != before)
     assert (tmp_path / "job" / "report.json").is_file()
-    with contextlib.closing(connect(robot[0])) as again, pytest.raises(RobotRefused, match="stopped"):
+    with contextlib.closing(connect(robot[0])) as again, pytest.raises(RobotRefused):
         again.act(np.zeros(3))
 
 

@@ -6,7 +6,7 @@ from app.episodes.replay_clock import ReplayClock
 from app.episodes.trajectory import read_trajectory
 from app.services.examples.presets import PRESETS
 from app.services.examples.stories import Stories
-from osfcore.control.first_frame import prepared_from_json
+from osfcore.control.prepared import prepared_from_json
 from osfcore.errors import CorruptFile, UnknownName
 
 MOST_BYTES = 2_000_000

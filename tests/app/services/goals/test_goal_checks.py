@@ -19,6 +19,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from tests.app.storage.test_database import record
+from tests.support.errors import about
 
 LABELS = {"x": "Cracker box", "y": "Mug", "z": "Bowl"}
 
@@ -150,9 +151,9 @@ def test_a_goal_for_another_table_names_that_table(checks, goal, home):
 
 
 def test_without_a_table_a_goal_or_a_field_there_is_nothing_to_compare(checks, monkeypatch):
-    with pytest.raises(UnknownName, match="goal"):
+    with pytest.raises(UnknownName, check=about("goal")):
         checks.check("none")
-    with pytest.raises(MissingFields, match="z"):
+    with pytest.raises(MissingFields, check=about("z")):
         checks.check("photo", "t")
     monkeypatch.setattr(Runner, "current", None)
     with pytest.raises(NoTable):

@@ -11,7 +11,7 @@ import osfcore.experiments.video_prediction as videos
 from app.cli.main import main
 from osfcore.experiments.relighting import CompareRelighting
 from osfcore.experiments.video_prediction import CompareVideos
-from tests.core.experiments.solids import SOLIDS
+from tests.support.solids import SOLIDS
 
 COMMON = ["--names", *SOLIDS, "--tasks", "1", "--objects", "2", "--workers", "1"]
 
