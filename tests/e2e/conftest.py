@@ -1,4 +1,5 @@
 import os
+import re
 import shutil
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,11 @@ def page_of_someone_who_knows(new_page, **options):
     page = new_page(**options)
     page.add_init_script("try { sessionStorage.setItem('osf-story-seen', '1') } catch {}")
     return page
+
+
+def leave_out_view(page):
+    """Let an empty frame stand for the 3D view: drawn without a GPU it takes time that other parts of the page need."""
+    page.route(re.compile(r"/viewer/[^/]+/\?"), lambda route: route.fulfill(content_type="text/html", body=""))
 
 
 @pytest.hookimpl(hookwrapper=True)

@@ -8,9 +8,9 @@ import pytest
 from osfcore.photo.calibration import board_place
 from tests.app.api.routes.test_calibration import ON_TABLE, TILTS, png_of
 from tests.app.api.routes.test_table_photos import gray
-from tests.core.photo.seen_boards import K, tilted
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import leave_out_view, watch_errors
 from tests.live import call, free_port, start_service, stop_service
+from tests.support.boards import K, tilted
 
 pytestmark = pytest.mark.e2e
 
@@ -28,6 +28,7 @@ def page(browser, port):
     page = browser.new_page(viewport={"width": 1440, "height": 1000})
     page.problems = []
     watch_errors(page)
+    leave_out_view(page)
     page.goto(f"http://127.0.0.1:{port}/?tab=photo")
     page.click("#calibration > summary")
     yield page

@@ -7,10 +7,10 @@ import urllib.request
 import pytest
 
 from tests.app.services.test_image_sets import zipped
-from tests.core.fields.sets import write_set
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import leave_out_view, watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
+from tests.support.ellipsoid_sets import write_set
 
 pytestmark = pytest.mark.e2e
 GELATIN = "009_gelatin_box"
@@ -30,6 +30,7 @@ def page(browser, url):
     page = browser.new_page(viewport={"width": 1366, "height": 900}, color_scheme="light")
     page.problems = []
     watch_errors(page)
+    leave_out_view(page)
     page.on("console", lambda m: page.problems.append(m.text) if m.type == "error" else None)
     page.goto(url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)

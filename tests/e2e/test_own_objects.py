@@ -7,7 +7,7 @@ import urllib.request
 import pytest
 
 from tests.app.api.routes.test_own_objects import glb
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import leave_out_view, watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
 
@@ -32,6 +32,7 @@ def page(browser, url):
     page = browser.new_page(viewport={"width": 1366, "height": 900}, color_scheme="light")
     page.problems = []
     watch_errors(page)
+    leave_out_view(page)
     page.goto(url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)
     page.click("#tab-objects")

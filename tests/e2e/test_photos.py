@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from pillow_heif import register_heif_opener
 
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import leave_out_view, watch_errors
 from tests.live import call, free_port, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
@@ -44,6 +44,7 @@ def page(browser, port, goals):
     page = browser.new_page(viewport={"width": 1440, "height": 900})
     page.problems = []
     watch_errors(page)
+    leave_out_view(page)
     page.goto(f"http://127.0.0.1:{port}/")
     page.wait_for_selector("#start-episode:not([disabled])", timeout=WAIT_MS)
     yield page

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.core.robots.robots import NAMES, example, noted, serving, simulated, toward_middle, until
 from tests.e2e.conftest import ARTIFACTS, watch_errors
 from tests.live import free_port, start_service, stop_service
+from tests.support.robots import NAMES, example, noted, serving, simulated, toward_middle, until
 
 pytestmark = pytest.mark.e2e
 WAIT_MS = 60_000

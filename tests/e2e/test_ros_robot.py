@@ -9,10 +9,10 @@ import pytest
 
 from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.io.image_file import encode_jpeg, to_uint8
-from tests.core.robots.robots import NAMES, simulated, toward_middle, until
-from tests.core.robots.ros_table import QUERY, TableStandIn
 from tests.e2e.conftest import ARTIFACTS, watch_errors
 from tests.live import free_port, start_service, stop_service
+from tests.support.robots import NAMES, simulated, toward_middle, until
+from tests.support.ros_robots import QUERY, TableStandIn
 
 pytestmark = pytest.mark.e2e
 SIDE = 256

@@ -10,7 +10,7 @@ from PIL import Image
 from osfcore.geometry.cameras import goal_camera
 from tests.app.api.routes.test_table_photos import box_around, jpeg_of
 from tests.app.conftest import until
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import leave_out_view, watch_errors
 from tests.live import call, free_port, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
@@ -57,6 +57,7 @@ def page(browser, port, scene):
     page = browser.new_page(viewport={"width": 1440, "height": 900})
     page.problems = []
     watch_errors(page)
+    leave_out_view(page)
     page.goto(f"http://127.0.0.1:{port}/?tab=photo")
     yield page
     page.close()
