@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from osfcore.io.image_set import read_image_set
-from tests.core.fields.sets import write_set
+from tests.support.ellipsoid_sets import write_set
 
 
 @pytest.fixture(scope="session")
