@@ -24,6 +24,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.states import SceneState
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.world.imaging import RayTracer, TracedMesh
+from tests.support.errors import about
 
 BOX, CAN = "009_gelatin_box", "005_tomato_soup_can"
 LENGTHS = (3, 2)
@@ -187,7 +188,6 @@ def test_without_the_library_one_sentence_tells_what_to_install(folders, library
 OPENED = """
 import json, sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from tests.support.errors import about
 data = LeRobotDataset("osf/episodes", root=sys.argv[1], delta_timestamps={"action": [0, 0.2]})
 rows = [data[n] for n in range(len(data))]
 image = lambda row, name: (255 * row[f"observation.images.{name}"]).permute(1, 2, 0).tolist()

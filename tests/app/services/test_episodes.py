@@ -339,7 +339,7 @@ def test_frames_are_shown_whole_and_in_parts(episodes, broken_off):
     for part in ("all", "goal", "now", "estimate", "difference"):
         png = np.frombuffer(episodes.frame(broken_off, 1, part), np.uint8)
         np.testing.assert_array_equal(cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1], part_of(drawn(1), part))
-    with pytest.raises(UnknownName, check=about("round")):
+    with pytest.raises(UnknownName, check=about("frame")):
         episodes.frame(broken_off, 2, "all")
 
 
@@ -347,7 +347,7 @@ def test_a_frame_that_is_deleted_while_it_is_asked_for_is_unknown(episodes, runn
     frames = runner.jobs.folder(broken_off.id) / FRAMES_FOLDER
     (frames / "001.png").unlink()
     monkeypatch.setattr(Path, "is_file", lambda _: True)  # as it was a moment ago
-    with pytest.raises(UnknownName, check=about("round")):
+    with pytest.raises(UnknownName, check=about("frame")):
         episodes.frame(broken_off, 1, "all")
 
 
@@ -358,7 +358,7 @@ def test_frames_that_are_damaged_or_not_there_yet_are_told(episodes, runner, bro
     with pytest.raises(CorruptFile, check=about("001.png")):
         episodes.file(broken_off, VIDEO_FILE)
     fresh = episodes.start(AskedEpisode(poses=POSES))
-    with pytest.raises(UnknownName, check=about("round")):
+    with pytest.raises(UnknownName, check=about("frame")):
         episodes.frame(fresh, 0, "all")
     assert episodes.files(fresh) == ()
 

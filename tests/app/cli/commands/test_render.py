@@ -51,7 +51,7 @@ def test_mistakes_are_told_in_words(scene_file, tmp_path):
     out = tmp_path / "image.png"
     with pytest.raises(InvalidInput, check=about("camera")):
         Render(scene_file(MUSTARD), out, camera="9", data_dir=tmp_path).run()
-    with pytest.raises(InvalidInput, check=about("image")):
+    with pytest.raises(InvalidInput, check=about("output file")):
         Render(scene_file(MUSTARD), tmp_path / "image.jpg", data_dir=tmp_path).run()
     with pytest.raises(UnknownName, check=about("spoon")):
         Render(scene_file("spoon"), out, data_dir=tmp_path).run()
