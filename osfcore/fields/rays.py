@@ -193,10 +193,10 @@ def march(
     offsets = np.full(count, 0.5, np.float32) if offsets is None else offsets
     # Other memory layouts and types would be compiled anew, which takes half a minute.
     origins, directions, offsets = (np.array(a, np.float32, order="C") for a in (origins, directions, offsets))
-    voxel, step, least, passing = (np.float32(n) for n in (field.voxel, step, min_weight, min_transmittance))
+    voxel, every, least, passing = (np.float32(n) for n in (field.voxel, step, min_weight, min_transmittance))
     grid = field.density, field.macro, field.origin, voxel
     with ONE_AT_A_TIME:
-        _march(origins, directions, *grid, step, offsets, least, passing, ts, counts)
+        _march(origins, directions, *grid, every, offsets, least, passing, ts, counts)
     return ts, np.arange(most) < counts[:, None]
 
 

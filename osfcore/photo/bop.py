@@ -477,12 +477,12 @@ def _bop_files(folder: Path, image: int | None) -> dict[str, Path]:
     numbered = [match for path in folder.iterdir() if (match := _BOP_NAME.fullmatch(path.name))]
     if not numbered:
         return {}
-    image = _only("image of the masks", image, {int(match[1]) for match in numbered})
+    shown = _only("image of the masks", image, {int(match[1]) for match in numbered})
     table = next((place / SCENE_GT for place in (folder, folder.parent) if (place / SCENE_GT).is_file()), None)
     if table is None:
         raise InvalidInput(f"{SCENE_GT} of the masks", "missing", "in the folder above them: it tells what they show")
-    names = scene_gt_names(table, image)
-    its = {int(match[2]): folder / match[0] for match in numbered if int(match[1]) == image}
+    names = scene_gt_names(table, shown)
+    its = {int(match[2]): folder / match[0] for match in numbered if int(match[1]) == shown}
     return {name: its[index] for index, name in enumerate(names) if index in its}
 
 

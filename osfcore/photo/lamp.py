@@ -358,7 +358,8 @@ def lit_pixels(
         if photo.on_table:
             parts.append((*_table_pixels(photo, shadows.centre, covered_m), TABLE, view))
     owner, view = (np.repeat([p[k] for p in parts], [len(p[0]) for p in parts]).astype(int) for k in (4, 5))
-    return LitPixels(*_joined(parts), owner, view, shadows)
+    radiance, albedo, points, normals = _joined(parts)
+    return LitPixels(radiance, albedo, points, normals, owner, view, shadows)
 
 
 def _joined(parts: Sequence[tuple[Any, ...]]) -> list[Vectors]:
