@@ -143,6 +143,7 @@ def test_every_module_imports_and_its_public_names_exist():
                     assert hasattr(module, name), f"{info.name}.{name}"
 
 
+@pytest.mark.slow
 def test_web_process_starts_without_heavy_packages():
     """The page must be there within seconds: physics, torch and decomposition load in other processes."""
     heavy = ("torch", "pybullet", "coacd", "h5py", "numba")

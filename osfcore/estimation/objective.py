@@ -167,8 +167,8 @@ class RestingOrientations:
         """Height of the lowest point of the object in a pose [m]."""
         return float(pose.apply(self.hull)[:, 2].min())
 
-    def poses_at(self, centres: Float[np.ndarray, "K 3"], quaternions: Float[np.ndarray, "K 4"]) -> Pose:
-        """Return poses in given orientations whose centres of mass lie at given places [m]."""
+    def poses_at(self, centres: Float[np.ndarray, "... 3"], quaternions: Float[np.ndarray, "K 4"]) -> Pose:
+        """Return K poses in given orientations whose centres of mass lie at one place or at K places [m]."""
         return Pose(centres - rotate(quaternions, self.centre), quaternions)
 
 

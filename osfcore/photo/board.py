@@ -550,7 +550,7 @@ def _grey(image: Image8) -> Grey:
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
 
 
-def _reduced(grey: Grey, side: int) -> Grey:
+def _reduced(grey: Grey, side: int) -> UInt8[np.ndarray, "reduced_h reduced_w"]:
     """Return a copy whose longer side is at most this long [px]."""
     scale = side / max(grey.shape)
     return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey

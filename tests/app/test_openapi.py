@@ -148,5 +148,6 @@ def test_operation_names_are_unique_and_every_error_is_a_problem():
                 assert list(answer["content"]) == ["application/problem+json"]
 
 
+@pytest.mark.slow
 def test_schema_is_valid_openapi():
     openapi_spec_validator.validate(create_app().openapi())

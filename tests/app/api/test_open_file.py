@@ -136,6 +136,7 @@ def test_downloads_are_whole_while_the_file_is_replaced_and_deleted(client, path
     assert descriptors(path) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", ["2.3", "2.4"])
 def test_a_file_is_closed_when_whoever_asked_has_gone(path, spec):
     path.write_bytes(version(1))

@@ -59,6 +59,7 @@ def test_it_tells_its_version(capsys):
     assert capsys.readouterr().out == f"osf {version('osf-manipulation')}\n"
 
 
+@pytest.mark.slow
 def test_the_simulator_is_loaded_without_a_word():
     done = subprocess.run([sys.executable, "-c", "import osfcore.world.tabletop"], capture_output=True, check=True)
     assert (done.stdout, done.stderr) == (b"", b"")

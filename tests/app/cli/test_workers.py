@@ -36,6 +36,7 @@ def test_more_workers_are_other_processes():
         assert executor.submit(os.getpid).result() != os.getpid()
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_killed_parent(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(

@@ -142,6 +142,7 @@ def test_a_table_is_made_pushed_and_seen(osf, table):
     assert np.abs(osf.image("2", size=64) - image).max() > 0.1
 
 
+@pytest.mark.slow
 def test_goals_are_sent_and_made(osf, table, tmp_path):
     drawn = osf.random_goal(1, moved=1)
     assert set(drawn.names) == {BOX, BOTTLE}

@@ -122,6 +122,7 @@ def test_a_goal_photo_of_another_shape_is_not_distorted(folders, library, tmp_pa
     assert shown[: SIDE // 4 - 4].max() < 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("obs", "left_out"), [("poses", "observation.images"), ("pixels", "environment_state")])
 def test_what_is_not_asked_for_is_left_out(folders, library, tmp_path, obs, left_out):
     write_lerobot(folders, library, tmp_path / "set", obs=obs, image_side=SIDE)
@@ -168,6 +169,7 @@ def test_folders_that_cannot_be_learned_from_are_refused_by_name(library, tmp_pa
     assert not (tmp_path / "set").exists()
 
 
+@pytest.mark.slow
 def test_the_command_writes_it_into_a_new_folder_alone(folders, library, tmp_path, capsys):
     (tmp_path / "objects").symlink_to(library.root)
     out = tmp_path / "set"

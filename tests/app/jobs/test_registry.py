@@ -130,6 +130,7 @@ def test_a_job_that_does_not_listen_is_ended(open_jobs):
     assert not jobs.folder(job.id).exists()
 
 
+@pytest.mark.slow
 def test_a_job_that_dies_fails_and_the_next_one_runs(open_jobs):
     jobs, _ = open_jobs()
     job, following = jobs.submit(*LONG), jobs.submit(*TABLE)
@@ -140,6 +141,7 @@ def test_a_job_that_dies_fails_and_the_next_one_runs(open_jobs):
     assert until_state(jobs, following, "done").state == "done"
 
 
+@pytest.mark.slow
 def test_pausing_stops_progress_and_resuming_goes_on(open_jobs):
     jobs, _ = open_jobs()
     job = jobs.submit(*LONG)
@@ -152,6 +154,7 @@ def test_pausing_stops_progress_and_resuming_goes_on(open_jobs):
     until(lambda: jobs.get(job.id).done > held)
 
 
+@pytest.mark.slow
 def test_after_a_stop_running_jobs_failed_and_waiting_ones_go_on(open_jobs):
     jobs, _ = open_jobs()
     job, waiting = jobs.submit(*LONG), jobs.submit(*TABLE)
@@ -222,6 +225,7 @@ def test_cancelling_a_waiting_twin_leaves_the_workshop_of_the_running_one(open_j
     assert not workshop(data_dir, "box").exists()
 
 
+@pytest.mark.slow
 def test_progress_that_comes_too_soon_is_told_when_nothing_follows(open_jobs):
     jobs, events = open_jobs()
     job = jobs.submit(*LONG)

@@ -42,6 +42,7 @@ def is_running(pid):
         return False
 
 
+@pytest.mark.slow
 def test_children_do_not_see_interrupts_and_leave_by_themselves(capfd):
     process, connection = launch(echo, "echo", "hello")
     greeting, pid, is_blocked = connection.recv()
@@ -55,6 +56,7 @@ def test_children_do_not_see_interrupts_and_leave_by_themselves(capfd):
     assert capfd.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_ending_takes_grandchildren_along():
     process, connection = launch(with_child, "parent")
     child = connection.recv()
@@ -73,6 +75,7 @@ def test_a_quiet_import_still_fails_loudly(capfd):
     assert capfd.readouterr().err == "heard"
 
 
+@pytest.mark.slow
 def test_memory_beyond_the_limit_is_refused():
     process, connection = launch(with_little_memory, "little")
     assert (connection.recv(), connection.recv()) == (64 << 20, "refused")

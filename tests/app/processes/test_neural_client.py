@@ -49,6 +49,7 @@ def test_it_starts_with_the_first_order(fields_dir, state):
         draw(link, state).result(5)
 
 
+@pytest.mark.slow
 def test_of_many_orders_of_one_visitor_the_last_is_drawn(link, state):
     draw(link, state).result(COMPILE_S)
     futures = [draw(link, state, size=512, is_sharp=True) for _ in range(6)]
@@ -69,6 +70,7 @@ def test_too_much_at_once_is_refused(link, state):
     assert kinds == {type(None), ProcessBusy}
 
 
+@pytest.mark.slow
 def test_a_killed_renderer_says_so_and_comes_back(link, state):
     draw(link, state).result(COMPILE_S)
     process = link.process
@@ -93,6 +95,7 @@ def test_one_that_keeps_dying_is_left_alone_for_a_while(fields_dir, state):
     link.stop()
 
 
+@pytest.mark.slow
 def test_it_runs_other_processes_under_their_own_name(fields_dir, state):
     link = ProcessClient(predictor_main, (fields_dir,), "predictor of pushes")
     predicted = link.submit(PredictPushes("a", state, np.zeros((1, 2, 3)))).result(COMPILE_S)

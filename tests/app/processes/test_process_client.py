@@ -71,6 +71,7 @@ def test_one_that_lives_but_answers_nobody_is_replaced(echo):
     assert client.process is not hanging
 
 
+@pytest.mark.slow
 def test_one_that_was_stopped_for_a_moment_goes_on(echo):
     client = echo()
     client.call("here")
@@ -83,6 +84,7 @@ def test_one_that_was_stopped_for_a_moment_goes_on(echo):
     assert client.process is process
 
 
+@pytest.mark.slow
 def test_orders_that_nobody_reads_are_refused_in_the_end(echo):
     client = echo()
     client.call("here")

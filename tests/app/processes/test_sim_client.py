@@ -72,6 +72,7 @@ def test_commands_are_answered_and_refusals_told(link):
     assert link.status == "ready"
 
 
+@pytest.mark.slow
 def test_a_killed_simulation_comes_back_with_its_scenes(link, desk):
     create(link)
     moved = link.call(Act("a", (np.array([0.1, 0.1, 0.0]),)))
@@ -94,6 +95,7 @@ def test_waiting_commands_fail_clearly_when_it_dies(link):
             future.result(20)
 
 
+@pytest.mark.slow
 def test_a_frozen_simulation_comes_back_with_its_scenes(link, desk):
     create(link)
     frozen = link.process
@@ -104,6 +106,7 @@ def test_a_frozen_simulation_comes_back_with_its_scenes(link, desk):
     assert link.call(ResetScene("a")).state.names == ("003_cracker_box",)
 
 
+@pytest.mark.slow
 def test_too_much_at_once_is_refused(link):
     create(link)
     futures: list[Future] = [link.submit(TakeImage("a", "0", 48)) for _ in range(3 * MAX_PENDING)]

@@ -409,6 +409,7 @@ def test_an_episode_is_followed_to_its_end(service, services, done):
     is_problem(service.delete(f"/api/episodes/{episode['id']}"), 409)
 
 
+@pytest.mark.slow
 def test_every_file_can_be_downloaded_and_read(service, done, tmp_path):
     episode, *_ = done
     kinds, files = {}, {}

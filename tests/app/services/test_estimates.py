@@ -200,6 +200,7 @@ def test_scenes_that_cannot_be_estimated_are_told(estimates, runner, tmp_path):
 # Uploads
 
 
+@pytest.mark.slow
 def test_an_uploaded_folder_is_taken_in_with_its_prior(estimates, runner, tmp_path):
     job = upload(estimates, archive(tmp_path))
     assert job.params["of"] == {"scene": None, "revision": None, "file_name": "seen.zip"}

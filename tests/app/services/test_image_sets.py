@@ -86,6 +86,7 @@ def test_what_is_no_zip_is_refused(sets, tmp_path, data):
     assert list((tmp_path / "sets").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_zip_that_leads_elsewhere_writes_nothing_there(sets, tmp_path):
     with zipfile.ZipFile(tmp_path / "evil.zip", "w") as file:
         file.writestr("train/anno.json", "[]")
@@ -95,6 +96,7 @@ def test_a_zip_that_leads_elsewhere_writes_nothing_there(sets, tmp_path):
     assert not any(tmp_path.rglob("evil.txt"))
 
 
+@pytest.mark.slow
 def test_a_zip_bomb_is_refused(sets, tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("train/anno.json", b"0" * 50_000_000)
@@ -178,6 +180,7 @@ def test_an_upload_that_breaks_off_leaves_nothing(sets, archive, tmp_path):
     assert list((tmp_path / "sets").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_what_a_killed_service_left_half_done_goes_at_the_next_start(tmp_path, archive):
     sets = ImageSets(tmp_path / "sets")
     record = receive(sets, archive)

@@ -190,6 +190,7 @@ def test_changes_are_told_and_refusals_are_not(open_runner):
     assert np.allclose(change.record.state.light.position, [0, 0, 1])
 
 
+@pytest.mark.slow
 def test_hands_stay_off_a_scene_that_a_job_uses(open_runner):
     runner = open_runner(demo_scene=False)
     scene = runner.create_scene(names=(BOX,), seed=3)
@@ -323,6 +324,7 @@ def test_a_scene_that_cannot_be_stored_is_nowhere(open_runner, monkeypatch):
     assert [scene.id for scene in open_runner(demo_scene=False).scenes()] == [shown.id]
 
 
+@pytest.mark.slow
 def test_a_push_that_cannot_be_stored_has_happened_and_is_stored_later(open_runner):
     runner = open_runner(demo_scene=False)
     scene = runner.create_scene(names=(BOX,), seed=3)

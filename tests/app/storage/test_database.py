@@ -447,6 +447,7 @@ def found(place):
         return [number for number, _ in store.jobs()]
 
 
+@pytest.mark.slow
 def test_every_accepted_job_is_in_the_image_of_any_moment_and_after_a_kill(tmp_path):
     rng = random.Random(0)
     accepted = []

@@ -356,6 +356,7 @@ def test_the_largest_photos_fit_into_the_memory_of_the_process(reader):
         assert reader.read(data).pixels.shape == (2048, 2048, 3), mode
 
 
+@pytest.mark.slow
 def test_a_bomb_in_the_process_is_refused_and_hurts_nobody(reader):
     text = b"Comment\0\0" + zlib.compress(b"0" * 200_000_000, 9)
     with pytest.raises(PhotoRefused):
@@ -371,6 +372,7 @@ def test_a_decoder_that_hangs_is_ended_and_heals(reader):
     assert reader.read(b"sound") == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reader", [(odd_reader,)], indirect=True)
 def test_a_decoder_that_crashes_or_devours_memory_is_told_and_heals(reader):
     assert reader.read(b"sound") == 5

@@ -57,6 +57,7 @@ async def chunks(*parts):
         yield part
 
 
+@pytest.mark.slow
 def test_what_is_sent_in_pieces_is_there_as_a_whole(tmp_path):
     parts = [bytes([n]) * 400_000 for n in range(5)]
     asyncio.run(save(chunks(*parts), tmp_path / "new" / "upload"))
@@ -89,6 +90,7 @@ def test_what_cannot_be_used_is_refused_in_one_sentence(tmp_path, look, words, k
     assert "secret" not in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_stopping_ends_a_look(tmp_path):
     examiner, outcome = Examiner(dawdle, "drawing", names), []
 

@@ -82,6 +82,7 @@ def test_a_stopped_meter_tells_what_it_knew_and_measures_no_more(open_meter, tmp
     assert meter.usage().total == 0
 
 
+@pytest.mark.slow
 def test_nobody_waits_for_a_walk_that_takes_long(open_meter, tmp_path, monkeypatch):
     let = threading.Event()
     monkeypatch.setattr("app.storage.usage.folder_bytes", lambda *_: let.wait(20) and 9)

@@ -212,6 +212,7 @@ def test_a_plan_serves_for_as_many_actions_as_asked(world, oracle):
     assert sum(isinstance(event, ActionExecuted) for event in events) == 5
 
 
+@pytest.mark.slow
 def test_nothing_coming_nearer_is_noticed(world, oracle):
     events = list(begun(oracle, toward_middle(world), replace(SMALL, steps=18, planning=False)).run())
     stalled = [event for event in events if isinstance(event, Noticed) and event.matter == "stalled"]

@@ -92,6 +92,7 @@ def test_what_moves_takes_part_with_its_neighbours(shapes, table, part):
     assert not graph.touched.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("away", [0.002, 0.006, 0.011, 0.02])
 def test_a_can_is_touched_where_the_sweep_comes_close(shapes, table, away):
     """The pusher passes beside a can that is as good as round."""

@@ -101,6 +101,7 @@ def test_the_command_says_how_to_do_it_again(data, tmp_path):
     assert words.endswith(f"--iterations 5 --long-batch 7 --seed 3 --without {CAN} 'a b'")
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_weights(data, tmp_path, shapes, whole):
     parts = config(data, tmp_path)
     begun = train_dynamics(parts, shapes)

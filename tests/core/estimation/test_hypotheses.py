@@ -104,6 +104,7 @@ def test_an_object_is_found_wherever_it_lies(models, name, number, place):
         assert np.all(np.diff(found.scores) <= 0)
 
 
+@pytest.mark.slow
 def test_where_the_light_on_the_table_is_known_grey_things_are_not_table():
     name, light = "021_bleach_cleanser", np.array((-0.842, 0.483, 0.242))  # white, under a lamp at 14 deg
     bottle = shipped_models((name,))
@@ -122,6 +123,7 @@ def test_where_the_light_on_the_table_is_known_grey_things_are_not_table():
     assert np.linalg.norm(found.poses.position[0] - pose.position) < 0.02
 
 
+@pytest.mark.slow
 def test_what_a_known_scene_leaves_unexplained(models, truth):
     views = image_of(models, truth, side=96)
     names, params = truth.names, params_of(truth)
@@ -167,6 +169,7 @@ def sightings_at(truth, *shifts) -> list[TemplateMatches]:
     ]
 
 
+@pytest.mark.slow
 def test_the_right_sightings_and_the_light_are_found_together(models, truth, views, empty):
     matches = sightings_at(truth, (0.07, 0, 0), (0, 0.05, 0), (0, 0, 0), (-0.1, 0.02, 0))
     steps = list(SceneAssembly(models, *views, matches).scenes(empty))

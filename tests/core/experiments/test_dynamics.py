@@ -125,6 +125,7 @@ def test_windows_are_predicted_as_rollouts_from_their_starts(windows):
         np.testing.assert_allclose(found.quaternions[w, :4], alone.quaternions[0, 1:5], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_each_method_has_its_own_network(windows, tmp_path):
     write_network(tmp_path / "dynamics" / WEIGHTS_FILE, network())
     paper = load_predictor("paper", tmp_path, FIELDS, shapes())

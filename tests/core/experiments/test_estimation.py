@@ -206,6 +206,7 @@ def test_the_real_estimators_are_called_as_they_want_to_be(solids, library, tmp_
     assert np.abs(first.shown[0].ours.astype(int) - first.shown[0].truth).mean() < 20
 
 
+@pytest.mark.slow
 def test_tracks_and_goals_begin_with_estimates_and_never_with_the_truth(runner, oracle):
     first = done(runner.first(0))
     start = state_of(first)

@@ -80,6 +80,7 @@ def test_the_report_has_every_object_and_sheets_show_them(evaluated, solids):
         assert columns * 32 < width < columns * 32 + 64
 
 
+@pytest.mark.slow
 def test_what_was_measured_is_taken_over(evaluated, solids, library, monkeypatch):
     out, steps = evaluated
     simulated, real = [], module.simulate
@@ -99,6 +100,7 @@ def test_what_was_measured_is_taken_over(evaluated, solids, library, monkeypatch
     assert one == pytest.approx(another, abs=3)
 
 
+@pytest.mark.slow
 def test_a_killed_evaluation_goes_on_and_new_weights_are_measured_anew(library, tmp_path):
     write_fields(tmp_path / "data", library)
     fields = FieldLibrary(tmp_path / "data", shipped=tmp_path)

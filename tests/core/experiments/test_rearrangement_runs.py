@@ -94,6 +94,7 @@ def test_the_simulator_predicts_what_then_happens(task, library, world):
     np.testing.assert_allclose(predicted.pusher[0, 1], world.truth().pusher, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("knows_pushes", [True, False])
 def test_with_true_poses_it_comes_nearer(task, library, models, world, knows_pushes):
     settings = EpisodeSettings(steps=12, replan_every=2, plan=PlanSettings(samples=16))

@@ -327,6 +327,7 @@ def test_a_perfect_student_has_no_loss(student):
         assert float(stage.loss(*points, generator)) > 2e-3
 
 
+@pytest.mark.slow
 def test_a_training_by_way_of_a_teacher_goes_on_from_the_phase_it_was_in(pristine_set, tmp_path):
     config = TrainField(pristine_set, tmp_path / "egg.safetensors", iterations=60, device="cpu", recipe="distil",
                         teacher_width=32, teacher_depth=2)  # fmt: skip

@@ -108,6 +108,7 @@ def test_temporary_folders_vanish_and_take_old_ones_along(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_pip_takes_a_wheel_from_a_folder(tmp_path, monkeypatch):
     wheels, out = tmp_path / "wheels", tmp_path / "out"
     wheels.mkdir()

@@ -52,6 +52,7 @@ def test_the_truth_has_the_least_error(plain, truth, seen):
         assert right < wrong  # by little where the light is low, for eq. 5 has it overhead
 
 
+@pytest.mark.slow
 def test_cma_finds_positions_and_the_light(plain, truth, seen):
     steps = list(estimate_first(plain, seen, np.random.default_rng(0), QUICK))
     estimate = steps[-1].estimate

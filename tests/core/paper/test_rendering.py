@@ -25,6 +25,7 @@ def batch(positions, light=OVERHEAD, names=("a",), turn=(0, 0, 0), pusher=None) 
     return SceneBatch(tuple(names), positions, quaternions, light[None] / np.linalg.norm(light), pusher)
 
 
+@pytest.mark.slow
 def test_one_object_is_the_sum_of_equation_3():
     """Every pixel against densities and radiances asked of the networks in PyTorch."""
     field = empty_block(seed=3)

@@ -68,6 +68,7 @@ def test_a_reduced_photograph_is_that_of_the_camera_with_fewer_pixels(camera_jso
         known_camera(camera_json).lens_at((480, 640))
 
 
+@pytest.mark.slow
 def test_a_photograph_is_straightened_and_placed_as_calibrated(camera_json, raw):
     fixed, free = known_camera(camera_json), known_camera({**camera_json, "T_world_camera": None})
     located = locate_calibrated(raw, fixed)

@@ -131,6 +131,7 @@ def test_place_and_cone_are_recovered_within_their_deviations(place, cone):
         assert abs(found.lamp.outer_deg - cone[1]) < 4
 
 
+@pytest.mark.slow
 def test_of_a_distant_lamp_the_distance_stays_unknown():
     direction = np.array([0.5, -0.4, 0.7]) / np.linalg.norm([0.5, -0.4, 0.7])
     found = fit_near_lamp(scene(direction=direction), CENTRE)
@@ -140,10 +141,12 @@ def test_of_a_distant_lamp_the_distance_stays_unknown():
     assert found.lamp is None
 
 
+@pytest.mark.slow
 def test_light_from_everywhere_is_called_diffuse():
     assert fit_near_lamp(scene(ambient=0.8), CENTRE).is_diffuse
 
 
+@pytest.mark.slow
 def test_strength_is_relative_to_the_exposure_of_each_view():
     spot = SpotLamp(np.array([0.3, -0.2, 0.4]), CENTRE, 60, 75)
     pixels = scene(spot, views=2)
@@ -154,6 +157,7 @@ def test_strength_is_relative_to_the_exposure_of_each_view():
     np.testing.assert_allclose(found.strength[1], 0.4 * found.strength[0], rtol=0.1)
 
 
+@pytest.mark.slow
 def test_objects_alone_show_the_direction():
     spot = SpotLamp(np.array([0.4, 0.3, 0.5]), CENTRE, 60, 75)
     whole = scene(spot)

@@ -110,6 +110,7 @@ def spoiled(taken):
     return replace(taken.photo, masks={NAME: front, BEHIND: behind})
 
 
+@pytest.mark.slow
 def test_what_is_drawn_is_added_to_the_others_and_taken_from_the_own_mask(taken, spoiled, surfels):
     found = [at(taken.pose), at(Pose.identity(), BEHIND, iou=0.5)]
     (seen,) = without_others([spoiled], BEHIND, found, surfels)

@@ -62,6 +62,7 @@ def test_the_empty_table_falls_off_and_has_the_cones_edge(spot):
         np.testing.assert_allclose(rendered.rgb[0, 0][off_the_edge], expected[off_the_edge], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_lamp_200_m_away_is_the_distant_light():
     fields, scene = random_scene(1)
     spot = SpotLamp(200 * scene.light.direction, np.zeros(3), 10, 20)

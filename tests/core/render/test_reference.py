@@ -62,6 +62,7 @@ def test_a_uniform_slab_hides_one_minus_exp_of_its_depth(g):
         np.testing.assert_allclose(rendered.rgb[0, 0, 8, 8], hidden * np.array([0.2, 0.5, 0.9]), atol=0.02)
 
 
+@pytest.mark.slow
 def test_two_slabs_hide_as_much_as_their_depths_together():
     near, far = fog((0.05, 0.05, 0.01), g=-2.0), fog((0.05, 0.05, 0.02), g=-1.5)
     scene = state({"near": (0, 0, 0.2), "far": (0, 0, 0.05)}, ABOVE)
@@ -182,6 +183,7 @@ def test_light_and_view_turn_with_the_object():
         np.testing.assert_allclose(a.depth, b.depth, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_precision_and_device_hardly_matter():
     fields, scene = random_scene(9)
     one = SceneBatch.of(scene)

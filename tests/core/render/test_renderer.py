@@ -51,6 +51,7 @@ def same(slow, fast, atol: float = 1e-3) -> None:
 
 
 # Seeds are chosen so that one, two and four objects, pushers and lights down to 10 deg all occur.
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 6, 9, 11])
 def test_exact_is_the_reference(seed):
     fields, scene = random_scene(seed)

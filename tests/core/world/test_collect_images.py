@@ -162,6 +162,7 @@ def test_a_goal_is_one_view_without_pusher_and_masks(library, tmp_path):
     assert read_scene(tmp_path / "goal" / TRUTH_FILE).state.pusher is None
 
 
+@pytest.mark.slow
 def test_a_random_choice_depends_on_the_seed_alone_and_is_among_the_known(library, tmp_path):
     known = (*NAMES, "005_tomato_soup_can", "spoon")
     made = [

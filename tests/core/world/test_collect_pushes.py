@@ -188,6 +188,7 @@ def found(pushed):
     return run(pushed)
 
 
+@pytest.mark.slow
 def test_every_substep_in_which_something_moves_is_played_as_often_as_asked(pushed, found):
     twice, other, again = run(pushed, count=2), run(pushed, seed=1), run(pushed)
     assert len(found.step) > 20

@@ -94,6 +94,7 @@ def world_with(library):
         )
 
 
+@pytest.mark.slow
 def test_a_world_is_seen_under_its_lamp_and_on_its_table(world_with):
     changed = (None, Conditions(lamp=Lamp(intensity=0.5)), Conditions(table=TableSurface((0.2, 0.3, 0.6))))
     usual, dim, blue = (world_with(conditions) for conditions in changed)

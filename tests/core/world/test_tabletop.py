@@ -52,6 +52,7 @@ def moved(state: SceneState, shift) -> SceneState:
     return replace(state, poses=Pose(state.poses.position + shift, state.poses.quaternion))
 
 
+@pytest.mark.slow
 def test_same_seed_same_bits_whatever_happened_before_and_beside_it(tables):
     world, other = tables(), tables(3)
     first = world.reset(7)

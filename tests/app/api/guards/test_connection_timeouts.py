@@ -105,6 +105,7 @@ def test_a_header_that_comes_drop_by_drop_is_not_waited_for(port):
             pytest.fail("it was waited for")
 
 
+@pytest.mark.slow
 def test_a_body_may_take_its_time_if_it_keeps_coming():
     with serving(3.0, Patient) as port, socket.create_connection(("127.0.0.1", port)) as connection:
         connection.sendall(b"POST / HTTP/1.1\r\nHost: a\r\nConnection: close\r\nContent-Length: 8\r\n\r\n")

@@ -163,6 +163,7 @@ def test_orders_reach_the_job(service, services, waiting, monkeypatch):
     assert (settings["steps"], settings["plan"]["samples"]) == (5, 8)  # what is left out stays
 
 
+@pytest.mark.slow
 def test_one_that_was_interrupted_still_shows_what_it_has_done(interrupted):
     service, name, _ = interrupted
     address = f"/api/episodes/{name}"
@@ -192,6 +193,7 @@ def test_a_damaged_report_is_told_and_does_not_hide_the_list(interrupted, report
     assert name in [one["id"] for one in service.get("/api/episodes").json()["episodes"]]
 
 
+@pytest.mark.slow
 def test_its_events_end_with_it(live):
     _, scene = live.request("POST", "/api/scenes", {"seed": 1, "objects": [BOX]})
     _, job = live.request("POST", "/api/jobs", LONG)

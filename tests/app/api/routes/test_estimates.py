@@ -203,6 +203,7 @@ def test_missing_estimates_are_not_found(service, method, tail):
     is_problem(getattr(service, method)(f"/api/estimates/none{tail}"), 404)
 
 
+@pytest.mark.slow
 def test_an_estimate_in_the_middle_of_a_step_is_cancelled(service, scene):
     accepted = service.post("/api/estimates", json={"scene": scene["id"]})
     address = accepted.headers["location"]
@@ -255,6 +256,7 @@ def test_the_estimate_on_disk_is_what_was_told(services, first):
     assert read_estimated(path).trusted is first["estimate"]["trusted"]
 
 
+@pytest.mark.slow
 def test_the_method_as_published_is_told_and_refused_for_goals(service, scene):
     busy = keep_busy(service)
     asked = service.post("/api/estimates", json={"scene": scene["id"], "method": "paper"})

@@ -48,6 +48,7 @@ def test_an_uploaded_set_is_listed_shown_and_deleted(service, archive):
     is_problem(service.delete(answer.headers["location"]), 404)
 
 
+@pytest.mark.slow
 def test_a_bad_set_is_refused_in_one_sentence(service, tmp_path):
     folder = write_set(tmp_path / "bad")
     entries = json.loads((folder / "train" / "anno.json").read_text())

@@ -110,6 +110,7 @@ def test_a_goal_that_was_made_here_has_no_photo(service, scene):
     assert service.get(f"{path}/check").json() == {"verdict": "shown", "refused": False, "text": "", "scene": None}
 
 
+@pytest.mark.slow
 def test_a_photo_of_nothing_is_refused_by_the_check_and_by_episodes(service, scene):
     goal = upload(service, photo(96, 96)).json()["id"]
     check = service.get(f"/api/goals/{goal}/check").json()
@@ -273,6 +274,7 @@ def test_without_a_draft_there_is_nothing_to_change(service, scene):
     is_problem(service.get("/api/goals/draft"), 404)
 
 
+@pytest.mark.slow
 def test_a_scene_that_a_job_drives_is_left_alone(service, held):
     for method, address, body in (
         ("post", "/api/goals", {"random": {}}),

@@ -36,6 +36,7 @@ def test_a_collection_runs_to_its_end_and_can_be_downloaded(service):
     is_problem(service.delete(accepted.headers["location"]), 409)
 
 
+@pytest.mark.slow
 def test_pushes_end_in_one_file(service):
     body = {"kind": "collect_pushes", "params": {"episodes": 2, "steps": 3, "objects": 2, "seed": 1}}
     job = finished(service, service.post("/api/jobs", json=body).headers["location"])
@@ -45,6 +46,7 @@ def test_pushes_end_in_one_file(service):
         assert len(file.keys()) > 0
 
 
+@pytest.mark.slow
 def test_one_runs_the_rest_wait_with_their_places(service, services):
     first = service.post("/api/jobs", json=LONG).json()
     until(lambda: service.get(f"/api/jobs/{first['id']}").json()["done"] > 0)
@@ -96,6 +98,7 @@ def test_a_job_that_cannot_be_stored_is_not_answered_202(service, services):
     assert service.get("/api/jobs").json() == before
 
 
+@pytest.mark.slow
 def test_a_finished_job_is_removed_for_good_and_a_live_one_is_not(service, services):
     busy = keep_busy(service)
     detail = is_problem(service.delete(f"/api/jobs/{busy}", params={"forget": True}), 409)["detail"]
@@ -110,6 +113,7 @@ def test_a_finished_job_is_removed_for_good_and_a_live_one_is_not(service, servi
     assert not services.runner.jobs.folder(busy).exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["episodes", "estimates"])
 def test_finished_episodes_and_estimates_are_removed_for_good(service, services, scene, kind):
     busy = keep_busy(service)

@@ -118,6 +118,7 @@ def views(client, name):
     return cv2.imdecode(np.frombuffer(png.content, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
+@pytest.mark.slow
 def test_a_thumbnail_holds_the_whole_object_from_all_around_and_is_drawn_once(own):
     sheet = views(own, "003_cracker_box")
     side = sheet.shape[0]
@@ -162,6 +163,7 @@ def test_what_is_no_mesh_is_refused_at_once(own):
         assert answer.json()["detail"].startswith("The uploaded file")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "kind", "words"),
     [
@@ -188,6 +190,7 @@ def test_a_mesh_that_cannot_be_used_is_told_in_one_sentence(own, content, kind, 
     assert own.get("/api/health").json()["status"] == "ok"
 
 
+@pytest.mark.slow
 def test_a_glb_that_points_to_files_of_the_server_reads_none_of_them(own, tmp_path):
     secret = tmp_path / "secret.bin"
     secret.write_bytes(bytes(36))

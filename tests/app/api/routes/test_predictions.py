@@ -27,6 +27,7 @@ def state(**changes):
     return {**STATE, "objects": [STATE["objects"][0] | placed], **changes}
 
 
+@pytest.mark.slow
 def test_many_pushes_of_a_state_are_predicted_in_order(service):
     actions = [[[0.3, 0, 0]] * 4, [[0, 0, 0]] * 4, [[-0.3, 0, 0]] * 4]
     told = ask(service, state=STATE, actions=actions)
@@ -128,6 +129,7 @@ def test_without_a_scene_or_with_an_object_that_has_no_field(library, tmp_path):
         assert client.post("/api/predictions", json={"actions": PUSH}).status_code == 200
 
 
+@pytest.mark.slow
 def test_a_broken_network_is_a_conflict_in_words(library, tmp_path):
     (tmp_path / "dynamics").mkdir()
     (tmp_path / "dynamics" / "pushes.safetensors").write_bytes(b"broken")

@@ -41,6 +41,7 @@ def test_leftovers_of_training_are_told_and_deleted(service, services, left):
     is_problem(service.delete(f"/api/storage/training/{left}"), 404)
 
 
+@pytest.mark.slow
 def test_leftovers_that_a_waiting_training_goes_on_from_stay(service, left):
     busy = keep_busy(service)
     params = {"name": left, "source": {"mesh": BOX}, "minutes": 0.1}
@@ -61,6 +62,7 @@ def test_only_what_is_listed_is_deleted(service, services, name):
     assert (services.settings.data_dir / "training" / ".hidden").is_dir()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "words"),
     [

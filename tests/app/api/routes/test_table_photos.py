@@ -79,6 +79,7 @@ def gray(width=64, height=48):
     return data.getvalue()
 
 
+@pytest.mark.slow
 def test_a_photo_is_kept_with_what_its_file_tells(service):
     photo = send(service, gray(), name="My table", focal_px=80)
     assert (photo["name"], photo["width"], photo["height"], photo["focal_px"]) == ("My table", 64, 48, 80)

@@ -58,6 +58,7 @@ def test_add_shows_in_the_list(tmp_path, capsys):
     assert "ball" in names
 
 
+@pytest.mark.slow
 def test_bad_input_is_an_error_of_ours(tmp_path):
     with pytest.raises(InvalidInput, check=about("source")):
         AssetsFetch(source=str(tmp_path / "none"), data_dir=tmp_path).run()

@@ -43,6 +43,7 @@ def test_figures_are_the_last_line_as_json_and_a_file(fields_dir, tmp_path, caps
     assert "Growth" in shown
 
 
+@pytest.mark.slow
 def test_estimates_are_timed(data_dir, library, tmp_path, capsys, monkeypatch):
     write_fields(data_dir, library)
     oracle = Oracle()

@@ -52,6 +52,7 @@ def test_mistakes_are_errors_of_ours(data_dir, tmp_path):
         CollectPushesCommand(tmp_path / "a.h5", workers=0, data_dir=data_dir).run()
 
 
+@pytest.mark.slow
 def test_an_observation_is_of_objects_with_fields(data_dir, tmp_path, capsys):
     shutil.copytree(data_dir / "objects" / "009_gelatin_box", data_dir / "objects" / "box_without_field")
     for seed in range(4):

@@ -34,6 +34,7 @@ def untried(monkeypatch):
         monkeypatch.setattr(f"osfcore.{place}", lambda *_: pytest.fail("the work began"))
 
 
+@pytest.mark.slow
 def test_an_observation_becomes_a_state_near_the_truth(scene, data_dir, tmp_path, capsys):
     out, sheets = tmp_path / "state.json", tmp_path / "sheets"
     arguments = ["estimate", "--observation", str(scene), "--out", str(out), "--data-dir", str(data_dir)]

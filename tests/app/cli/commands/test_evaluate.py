@@ -177,6 +177,7 @@ def runs(monkeypatch):
     return made
 
 
+@pytest.mark.slow
 def test_episodes_are_measured(data_dir, runs, capsys):
     arguments = ["eval", "mpc", "--data-dir", str(data_dir), "--tasks", "2", "--objects", "1", "--workers", "1"]
     assert main([*arguments, "--names", "009_gelatin_box", "--json"]) == 0

@@ -63,6 +63,7 @@ def get(port, path):
             return response.status
 
 
+@pytest.mark.slow
 def test_it_tells_one_address_and_leaves_at_once_with_streams_open(serve, data_dir):
     process = serve(data_dir)
     port = address(process)
@@ -110,6 +111,7 @@ def garbage(port):
         client.recv(1000)
 
 
+@pytest.mark.slow
 def test_what_goes_wrong_stands_in_the_log_file_too(serve, data_dir):
     process = serve(data_dir)
     port = address(process)
@@ -122,6 +124,7 @@ def test_what_goes_wrong_stands_in_the_log_file_too(serve, data_dir):
     assert err == log.read_text()
 
 
+@pytest.mark.slow
 def test_a_log_file_that_cannot_be_written_stops_nothing_and_is_told_once(serve, data_dir):
     (data_dir / "logs").mkdir()
     os.symlink("/dev/full", data_dir / "logs" / "service.log")
@@ -137,6 +140,7 @@ def test_a_log_file_that_cannot_be_written_stops_nothing_and_is_told_once(serve,
     assert len(err.splitlines()) == 4
 
 
+@pytest.mark.slow
 def test_without_objects_the_page_starts_and_says_how_to_get_them(serve, tmp_path):
     process = serve(tmp_path / "empty")
     port = address(process)
@@ -146,6 +150,7 @@ def test_without_objects_the_page_starts_and_says_how_to_get_them(serve, tmp_pat
     assert "osf assets fetch" in err
 
 
+@pytest.mark.slow
 def test_a_damaged_database_is_put_aside_and_told(serve, data_dir):
     (data_dir / FILE).write_bytes(b"no database" * 1000)
     process = serve(data_dir)

@@ -91,6 +91,7 @@ def report_of(place):
     return json.loads((place.folder / REPORT_FILE).read_text())
 
 
+@pytest.mark.slow
 def test_an_episode_pushes_what_is_on_the_scene_and_leaves_its_files(place, stage, sighted):  # noqa: F811
     before = stage.world.truth()
     *steps, last = list(episode_job(params(stage), place))
@@ -106,6 +107,7 @@ def test_an_episode_pushes_what_is_on_the_scene_and_leaves_its_files(place, stag
     assert last.note == last.text
 
 
+@pytest.mark.slow
 def test_what_is_told_rises_and_names_every_part_of_the_loop(place, stage, sighted):  # noqa: F811
     told = list(episode_job(params(stage), place))
     stages = list(dict.fromkeys(step.stage for step in told))
@@ -119,6 +121,7 @@ def test_what_is_told_rises_and_names_every_part_of_the_loop(place, stage, sight
     assert sum(isinstance(step.view, PlanSketch) for step in told) >= 3
 
 
+@pytest.mark.slow
 def test_what_a_view_must_not_miss_says_so(place, stage, sighted):  # noqa: F811
     for step in episode_job(params(stage), place):
         assert step.must_be_told == (step.view is not None and not isinstance(step.view, Looking))
@@ -134,11 +137,13 @@ def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_report_is_there_after_every_round(place, stage, sighted):  # noqa: F811
     counts = [len(report_of(place)["steps"]) for step in episode_job(params(stage), place) if step.ends_round]
     assert counts == [1, 2, 3, 4]
 
 
+@pytest.mark.slow
 def test_where_the_true_goal_is_known_the_report_scores_what_had_to_move(place, stage, sighted):  # noqa: F811
     list(episode_job(params(stage), place))
     report = report_of(place)
@@ -148,6 +153,7 @@ def test_where_the_true_goal_is_known_the_report_scores_what_had_to_move(place, 
     assert report["steps"][0]["truly_to_goal_mm"] == pytest.approx({NAMES[0]: 0, NAMES[1]: 60}, abs=0.1)
 
 
+@pytest.mark.slow
 def test_where_nobody_knows_the_true_goal_nothing_is_said_of_it(place, stage, sighted):  # noqa: F811
     list(episode_job(params(stage, truth=None), place))
     assert not {"moved", "score", "success_2cm"} & set(report_of(place))
@@ -167,6 +173,7 @@ def test_an_object_that_stays_did_not_have_to_move(place, stage, sighted, shift,
     assert report_of(place)["moved"] == list(moved)
 
 
+@pytest.mark.slow
 def test_settings_may_change_on_the_way(place, stage, sighted):  # noqa: F811
     acted = 0
     for step in episode_job(params(stage), place):

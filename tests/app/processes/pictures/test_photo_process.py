@@ -26,6 +26,7 @@ def picture(kind="PNG", size=(WIDTH, HEIGHT)):
     return data.getvalue()
 
 
+@pytest.mark.slow
 def test_a_photo_without_a_board_tells_its_size_and_that_its_camera_is_assumed():
     read = carry_out(ReadPhoto(picture(size=(4000, 3000))))
     assert (read.width, read.height, read.sent_width) == (2048, 1536, 4000)
@@ -34,6 +35,7 @@ def test_a_photo_without_a_board_tells_its_size_and_that_its_camera_is_assumed()
     assert Image.open(io.BytesIO(read.jpeg)).size == (2048, 1536)
 
 
+@pytest.mark.slow
 def test_a_given_focal_length_is_in_pixels_of_the_photo_as_it_was_sent():
     read = carry_out(ReadPhoto(picture(size=(4000, 3000)), focal_px=3000.0))
     assert read.source == "given"

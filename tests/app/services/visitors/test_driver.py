@@ -1,5 +1,6 @@
 import time
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -37,6 +38,7 @@ def test_a_page_that_reconnects_keeps_the_wheel():
     assert driver.now() == DriverChanged("a", 2)
 
 
+@pytest.mark.slow
 def test_a_driver_whose_page_loads_again_keeps_the_wheel_and_one_who_left_does_not():
     driver = Driver(lambda _: None, grace_s=2.0)
     for page in "ab":

@@ -37,6 +37,7 @@ def reproduced(library, asked):
     return list(reproduce(asked, FieldLibrary(None), library))
 
 
+@pytest.mark.slow
 def test_a_report_holds_all_cells_and_needs_nothing_beside_it(library, tmp_path, runs):
     asked = config(tmp_path, parts=("methods", "factors", "attribution"))
     report = reproduced(library, asked)[-1].report
@@ -64,6 +65,7 @@ def test_a_report_holds_all_cells_and_needs_nothing_beside_it(library, tmp_path,
     assert all(line.split(":")[0] in page for line in report["findings"])
 
 
+@pytest.mark.slow
 def test_episodes_that_several_sections_show_are_run_once(library, tmp_path, runs):
     steps = reproduced(library, config(tmp_path, parts=("factors", "attribution")))
     usual, factors, attributed = 2, 2, 5 * 2
@@ -75,6 +77,7 @@ def test_episodes_that_several_sections_show_are_run_once(library, tmp_path, run
     assert len(runs) == 3 * 2  # all rungs but ours
 
 
+@pytest.mark.slow
 def test_another_plan_takes_over_no_episode(library, tmp_path, runs):
     longer = replace(SMALLEST, settings=EpisodeSettings(steps=2, plan=PlanSettings(samples=9)))
     counts = []

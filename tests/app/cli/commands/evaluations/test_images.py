@@ -25,6 +25,7 @@ def small(monkeypatch):
     monkeypatch.setattr(videos, "predict_through_fields", lambda seen, *_: np.full_like(seen.frames, 0.5))
 
 
+@pytest.mark.slow
 def test_lights_are_compared(data_dir, capsys):
     arguments = ["eval", "relighting", "--data-dir", str(data_dir), *COMMON, "--elevations", "20", "70"]
     arguments += ["--methods", "ours", "paper"]
@@ -40,6 +41,7 @@ def test_lights_are_compared(data_dir, capsys):
     assert f"1 scenes. Pictures and figures: {data_dir / 'evaluation'}" in shown.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_predictions_are_compared(data_dir, tmp_path, capsys):
     arguments = ["eval", "video", "--data-dir", str(data_dir), "--out", str(tmp_path / "out"), *COMMON, "--steps", "2"]
     arguments += ["--methods", "copied", "ours"]
