@@ -1,5 +1,6 @@
-"""Each example runs as it stands, and tells something."""
+"""Each example runs as it stands, prints something, and needs the first level of the library only."""
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -38,3 +39,10 @@ def test_an_episode(library, tmp_path):
 def test_examples_are_short():
     for path in EXAMPLES.glob("*.py"):
         assert len(path.read_text().splitlines()) <= 100, path.name
+
+
+def test_examples_need_no_inner_module():
+    for path in EXAMPLES.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("osfcore"):
+                assert node.module == "osfcore", f"{path.name}: {node.module}"
