@@ -97,8 +97,8 @@ def read_photograph(data: bytes | Path, *, encoding: Encoding = "srgb") -> RawPh
         raise
     except MemoryError:
         raise CorruptFile(name, "it needs too much memory to be decoded; take a smaller one") from None
-    except Image.DecompressionBombError:  # of the decoder of WebP, which has its own limit
-        raise CorruptFile(name, f"it has far too many pixels; {allowed}") from None
+    except Image.DecompressionBombError:  # the decoders of WebP and GIF have a limit of their own, below ours
+        raise CorruptFile(name, "it has more pixels than its format may have here; send it as a JPEG") from None
     except Exception:  # decoders raise whatever their own code stumbles over
         raise CorruptFile(name, "it is damaged or incomplete, and cannot be decoded; send it anew") from None
 

@@ -289,6 +289,15 @@ def test_the_limit_of_other_code_on_pictures_is_neither_heeded_nor_touched(monke
     assert seen == {1000}
 
 
+def test_a_webp_beyond_the_limit_of_its_decoder_says_which_format_to_take():
+    """Its decoder refuses 192 million pixels, which other formats may have."""
+    width, height = 13_900, 13_800
+    canvas = bytes(4) + (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
+    head = b"WEBPVP8X" + struct.pack("<I", len(canvas)) + canvas
+    with pytest.raises(CorruptFile, check=about("JPEG")):
+        read_photograph(b"RIFF" + struct.pack("<I", len(head)) + head)
+
+
 def test_threads_that_read_at_once_ignore_odd_metadata_and_restore_the_filters_of_warnings():
     """The first is still decoding when the second begins, and ends before it."""
     odd = encoded(Image.fromarray(blocks()), "JPEG", exif=b"Exif\0\0II*\0\x08\0\0\0\x05\0cut")
