@@ -64,18 +64,20 @@ function drawCurve(at) {
 }
 
 function draw(at) {
-  const { step_s: times } = story();
+  const { step_s: times, now_columns: columns } = story();
   const step = Math.max(times.filter((time) => time <= at).length - 1, 0);
-  byId("story-now").style.transform = `translateY(${(-100 * step) / times.length}%)`;
+  const [column, row] = [step % columns, Math.floor(step / columns)];
+  byId("story-now").style.transform = `translate(${(-100 * column) / columns}%, ${(-100 * row) / Math.ceil(times.length / columns)}%)`;
   const stage = stageAt(at, step);
   if (byId("story-stage").textContent !== stage) byId("story-stage").textContent = stage; // it is read aloud
   drawCurve(at);
 }
 
 function begin() {
-  const { goal_image: goal, now_image: now, objects } = story();
+  const { goal_image: goal, now_image: now, now_columns: columns, objects } = story();
   byId("story-goal").src = goal;
   byId("story-now").src = now;
+  byId("story-now").style.width = `${100 * columns}%`;
   byId("story-goal").alt = `The photo of how ${objects.map(labelOf).join(", ")} should lie`;
   byId("story-again").hidden = true;
   draw(0);

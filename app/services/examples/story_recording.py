@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from app.episodes.file_names import FRAMES_FOLDER, PREPARED_FILE, REPORT_FILE, TRAJECTORY_FILE
-from app.episodes.frames import TILE_PX, Part, part_of, read_frames
+from app.episodes.frames import TILE_PX, part_of, read_frames
 from app.episodes.headless import EpisodeStep, run_episode
 from app.episodes.replay_clock import LOOK_S, ReplayClock
 from app.episodes.request import EpisodeOrder
@@ -30,6 +30,7 @@ from osfcore.geometry.states import EstimatedState, Observation
 from osfcore.io.files import as_mapping, read_json, write_atomically, write_json
 from osfcore.objects.asset_library import AssetLibrary
 
+NOW_COLUMNS = 8  # of the grid of pictures
 _QUALITY = 82  # of WebP
 
 
@@ -93,6 +94,7 @@ def _told(preset: Preset, report: dict[str, Any], trajectory: Path) -> dict[str,
         "objects": list(course.names),
         "moved": report["moved"],
         "goal_look_s": LOOK_S["first"],
+        "now_columns": NOW_COLUMNS,
         "step_s": [round(at_s, 3) for at_s in clock.step_s],
         "left_mm": [{name: step["truly_to_goal_mm"][name] for name in course.names} for step in steps],
         "pushes": report["steps_done"],
@@ -103,14 +105,17 @@ def _told(preset: Preset, report: dict[str, Any], trajectory: Path) -> dict[str,
 
 
 def _write_pictures(folder: Path, out: Path) -> None:
-    """The goal, and what the goal camera saw after each round below each other."""
+    """Write the goal, and what the goal camera saw after each round, row by row: a WebP is at most 16,383 px high."""
     frames = list(read_frames(folder / FRAMES_FOLDER))
-    tiles: dict[str, list[UInt8[np.ndarray, "h w 3"]]] = {}
-    parts: tuple[Part, ...] = ("goal", "now")
-    for part in parts:
-        tiles[part] = [part_of(frame, part) for frame in (frames[:1] if part == "goal" else frames)]
-    for part, images in tiles.items():
-        strip = np.concatenate([image[:TILE_PX, :TILE_PX] for image in images])
-        data = io.BytesIO()
-        Image.fromarray(strip).save(data, "WEBP", quality=_QUALITY, method=6)
-        write_atomically(out / f"{part}.webp", data.getvalue())
+    _write_grid(out / "goal.webp", [part_of(frames[0], "goal")], columns=1)
+    _write_grid(out / "now.webp", [part_of(frame, "now") for frame in frames], columns=NOW_COLUMNS)
+
+
+def _write_grid(path: Path, images: list[UInt8[np.ndarray, "h w 3"]], columns: int) -> None:
+    grid = np.zeros((-(-len(images) // columns) * TILE_PX, columns * TILE_PX, 3), np.uint8)
+    for number, image in enumerate(images):
+        row, column = divmod(number, columns)
+        grid[row * TILE_PX :, column * TILE_PX :][:TILE_PX, :TILE_PX] = image
+    data = io.BytesIO()
+    Image.fromarray(grid).save(data, "WEBP", quality=_QUALITY, method=6)
+    write_atomically(path, data.getvalue())

@@ -116,7 +116,10 @@ def test_rows_in_any_order_are_stored_in_that_of_the_grid(field):
     index[index > 0] = 1 + order[index[index > 0] - 1]
     rows = field.rows.copy()
     rows[1 + order] = field.rows[1:]
-    assert field_bytes(replace(field, index=index, rows=rows)) == field_bytes(field)
+    stored, ours = load(field_bytes(field)), load(field_bytes(replace(field, index=index, rows=rows)))
+    assert stored.keys() == ours.keys()
+    for name, tensor in stored.items():
+        np.testing.assert_array_equal(ours[name], tensor)
 
 
 def test_files_that_are_missing_or_huge_are_refused(field, tmp_path):
