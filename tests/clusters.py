@@ -10,7 +10,8 @@ import numpy as np
 from distributed import LocalCluster
 
 from osfcore.experiments.harness import TaskResult
-from osfcore.fields.train_kiloosf import FieldStep, TrainField, train_field
+from osfcore.fields.train_kiloosf import TrainField, train_field
+from osfcore.fields.train_osf import FieldStep
 from osfcore.inspection.contact_sheet import Comparison
 from tests.support.rendered_sets import QUICK
 

@@ -8,19 +8,17 @@ it, and then from the images. A checkpoint beside the output lets the same comma
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 from scipy import ndimage
 from torch import Tensor
 
-from osfcore.errors import CorruptFile, InvalidInput, check_seed
+from osfcore.errors import InvalidInput
 from osfcore.fields.devices import pick_device
 from osfcore.fields.hollow import fit_voxels, open_hollows, without_fog
 from osfcore.fields.kiloosf import (
@@ -34,36 +32,28 @@ from osfcore.fields.kiloosf import (
     without_light,
 )
 from osfcore.fields.osf import OSF, OSFSize
-from osfcore.fields.rays import (
-    FIRST_NORMAL,
-    RayBatch,
-    RaySource,
-    first_shell,
-    march,
-    refine,
-    reshelled,
-    seen_corners,
-    trim,
-)
+from osfcore.fields.rays import FIRST_NORMAL, RayBatch, first_shell, march, refine, reshelled, seen_corners, trim
 from osfcore.fields.train_osf import (
     Checkpoint,
+    FieldSettings,
+    FieldStep,
+    FieldTraining,
     Holdout,
+    Learner,
+    Look,
     NetworkStage,
+    Pace,
     Rates,
     Stage,
     TeacherRecipe,
     baked_g,
-    check_budget,
     corners,
     first_teacher,
     restored_teacher,
 )
 from osfcore.fields.visual_hull import silhouette_box
 from osfcore.fields.volume_rendering import alphas_from_thickness
-from osfcore.io.checkpoint import going_on_from
-from osfcore.io.files import write_atomically, write_json
-from osfcore.io.image_set import ImageSet, read_splits
-from osfcore.io.output_paths import check_weights_place
+from osfcore.io.image_set import ImageSet
 from osfcore.progress import Progress
 
 # From an OSF to a KiloOSF: the second of the paper's three steps; fine-tuning on images follows.
@@ -229,6 +219,7 @@ class Distillation(Stage):
 # The whole training: its settings, its recipe, and its run.
 
 
+_CARVING, _REFINING = "Carving the silhouettes", "Refining the shell"  # reported before phases begin
 _COARSE_RATES, _FINE_RATES = Rates(2e-2, 1e-2), Rates(2e-2, 1e-3)
 
 
@@ -272,76 +263,35 @@ class Recipe:
 
 
 @dataclass(frozen=True, slots=True)
-class Pace:
-    """How often a training reports; it does not change what is learned.
-
-    Attributes:
-        report_s: between two reports [s].
-        checkpoint_s: between two checkpoints [s].
-        clock: the time that counts for both and for the budget [s].
-    """
-
-    report_s: float = 1.0
-    checkpoint_s: float = 20.0
-    clock: Callable[[], float] = time.monotonic
-
-
-@dataclass(frozen=True, slots=True)
-class TrainField:
+class TrainField(FieldSettings):
     """A training run.
 
     Attributes:
-        data: image set in the OSF format; `train` is learned from, `test` measured on.
-        out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
-        minutes: time budget of the descent [min].
-        device: "auto", "cpu" or "cuda".
-        seed: of everything random.
-        iterations: instead of the time budget, that many steps: repeatable on one machine.
         hollow: the object has hollows that no silhouette shows, such as a bowl's; "direct" only.
         recipe: "direct", or "distil" for the paper's way over a teacher.
-        teacher_width: units of each layer of the teacher.
-        teacher_depth: its layers.
         lit: False for colours that do not depend on the light, as a NeRF's, to compare with; "direct" only.
     """
 
-    data: Path
-    out: Path
-    minutes: float = 30.0
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    seed: int = 0
-    iterations: int | None = None
     hollow: bool = False
     recipe: Literal["direct", "distil"] = "direct"
-    teacher_width: int = 64
-    teacher_depth: int = 4
     lit: bool = True
+
+    def check(self) -> None:
+        """Refuse what is out of range, and a place that cannot be written.
+
+        Raises:
+            InvalidInput: naming what is wrong, or if a file of somebody else lies where the metrics belong.
+            CannotWrite: if the output cannot be written.
+        """
+        if self.recipe not in ("direct", "distil"):
+            raise InvalidInput("recipe", self.recipe, "direct or distil")
+        if self.recipe == "distil" and not self.lit:
+            raise InvalidInput("recipe of a field without light", self.recipe, "direct")
+        FieldSettings.check(self)
 
 
 _AIMED_BYTES = 2_000_000
 _NEEDED_WEIGHTS = (0.02, 0.05, 0.1, 0.2)  # of samples that a view must show, tried until the file is small enough
-_OWN_METRICS = ("psnr_full", "psnr_mask")  # by which a file of metrics is known
-_LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
-_MIN_LOOK_S = 5.0
-_PHASES = {"direct": ("coarse", "fine"), "distil": ("teacher", "distil", "fine")}  # of the recipes
-_TRANSITIONS = {"distil": "Baking the teacher into a shell", "fine": "Refining the shell"}
-_Learner = Stage | NetworkStage  # a phase between its steps
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class FieldStep:
-    """How far training is.
-
-    Attributes:
-        progress: in seconds of the budget (or steps), with PSNR and time left in words.
-        psnr_full: on held-out images, over black [dB]; None until measured.
-        psnr_mask: the same inside the silhouettes, dilated by 2 px [dB].
-        preview: one held-out image: truth, ours, difference x 4; None between looks.
-    """
-
-    progress: Progress
-    psnr_full: float | None
-    psnr_mask: float | None
-    preview: UInt8[np.ndarray, "h w3 3"] | None
 
 
 def train_field(config: TrainField, recipe: Recipe | None = None, pace: Pace | None = None) -> Iterator[FieldStep]:
@@ -355,200 +305,88 @@ def train_field(config: TrainField, recipe: Recipe | None = None, pace: Pace | N
         CannotWrite: if the output cannot be written, which is tried first.
     """
     device = pick_device(config.device)
-    _check(config)
-    yield FieldStep(Progress(0, _total(config), "Reading the images"), None, None, None)
-    train, test = read_splits(config.data)
-    if train.is_opaque:
-        expected = "an object before a transparent background is expected (opaque sets show the bare table)"
-        raise CorruptFile(config.data, f"its images are opaque all over; {expected}")
+    config.check()
+    yield FieldStep(Progress(0, config.total, "Reading the images"))
+    train, test = config.images()
     if not config.lit:  # l = 0 leaves n . l and the networks' weights for l without a gradient
         train, test = (replace(part, light_directions=np.zeros_like(part.light_directions)) for part in (train, test))
-    yield from _Run(config, recipe or Recipe(), pace or Pace(), device, train, test).steps()
+    yield from _Training(config, recipe or Recipe(), pace or Pace(), device, train, test).steps()
 
 
-def _check(config: TrainField) -> None:
-    check_budget(config.minutes, config.iterations)
-    if config.recipe not in _PHASES:
-        raise InvalidInput("recipe", config.recipe, "direct or distil")
-    if config.recipe == "distil" and not config.lit:
-        raise InvalidInput("recipe of a field without light", config.recipe, "direct")
-    OSFSize(config.teacher_depth, config.teacher_width)  # refuses what cannot be built
-    check_seed(config.seed)
-    check_weights_place(config.out, _OWN_METRICS)
-
-
-def _total(config: TrainField) -> int:
-    return config.iterations or max(1, round(config.minutes * 60))
-
-
-class _Run:
-    """The state of one training run between its steps."""
-
+class _Training(FieldTraining):
     def __init__(
         self, config: TrainField, recipe: Recipe, pace: Pace, device: torch.device, train: ImageSet, test: ImageSet
     ) -> None:
-        self._config, self._recipe, self._pace, self._device = config, recipe, pace, device
+        super().__init__(config, asdict(recipe), pace, device, train, test)
+        self._config, self._recipe = config, recipe
         self._teacher = TeacherRecipe(OSFSize(config.teacher_depth, config.teacher_width))
-        self._images, self._source, self._test = train, RaySource(train), test
-        self._pixels = self._source.silhouette_pixels()
-        self._rng = np.random.default_rng(config.seed)
-        self._generator = torch.Generator(device).manual_seed(config.seed)
-        self._clock: dict[str, Any] = {"seconds": 0.0, "steps": 0, "looked_at": 0.0, "psnr": None}
-        self._checkpoint_path = config.out.with_suffix(".partial")
-        settings = {**asdict(config), "data": str(config.data.resolve()), "out": str(config.out)}
-        digests = [train.digest(), test.digest()]
-        self._fingerprint = {"settings": settings, "recipe": asdict(recipe), "images": digests}
-
-    def steps(self) -> Iterator[FieldStep]:
-        saved = Checkpoint.read(self._checkpoint_path, self._fingerprint)
-        names, ends = _PHASES[self._config.recipe], self._ends()
-        if saved is not None:
-            with going_on_from(self._checkpoint_path):
-                name, learner = saved.stage, self._resumed(saved)
-            yield self._report("Going on from a checkpoint")
+        if config.recipe == "direct":
+            coarse_share = recipe.hollow_share if config.hollow else recipe.coarse_share
+            self.phases = {"coarse": (coarse_share, _CARVING), "fine": (1.0, _REFINING)}
         else:
-            yield self._report("Carving the silhouettes")
-            name, learner = names[0], self._first()
-        for number in range(names.index(name), len(names)):
-            if number > names.index(name):
-                yield self._report(_TRANSITIONS[names[number]])
-                learner = self._next(names[number], learner)
-                self._save(names[number], learner)
-            yield from self._descend(names[number], learner, ends[number - 1] if number else 0.0, ends[number])
-        yield self._report("Measuring on all held-out images")
-        yield self._finish(learner.snapshot())
+            self.phases = {
+                "teacher": (recipe.teacher_share, _CARVING),
+                "distil": (recipe.teacher_share + recipe.distil_share, "Baking the teacher into a shell"),
+                "fine": (1.0, _REFINING),
+            }
 
-    def _ends(self) -> tuple[float, ...]:
-        """Return the share of the budget at which each phase ends."""
+    def rays(self, phase: str) -> int:
+        return self._teacher.rays if phase == "teacher" else self._recipe.rays
+
+    def begun(self, phase: str, before: Learner | None) -> Learner:
         r = self._recipe
-        if self._config.recipe == "direct":
-            return r.hollow_share if self._config.hollow else r.coarse_share, 1.0
-        return r.teacher_share, r.teacher_share + r.distil_share, 1.0
-
-    def _first(self) -> _Learner:
-        box = silhouette_box(self._images, where=self._config.data)
-        r = self._recipe
-        if self._config.recipe == "distil":
-            return first_teacher(self._images, box, self._teacher, self._rng, self._device)
-        across = r.hollow_across if self._config.hollow else r.coarse_across
-        field = first_shell(self._images, box, across=across, cells=r.cells, hidden=r.hidden,
-                            inside_g=r.solid_g, rng=self._rng)  # fmt: skip
-        if self._config.hollow:
-            field = open_hollows(field, self._images, fog_g=r.hollow_g)
-            field = without_fog(fit_voxels(field, self._images, steps=r.hollow_steps, rays=r.rays, rng=self._rng))
-        return self._stage("coarse", field)
-
-    def _stage(self, name: str, field: KiloOSF) -> Stage:
-        r = self._recipe
-        return Stage(field, r.coarse_rates if name == "coarse" else r.fine_rates, self._device)
-
-    def _next(self, name: str, before: _Learner) -> _Learner:
-        """Return the learner of a phase, from that of the phase before."""
-        r, field = self._recipe, before.snapshot()
+        if before is None:
+            box = silhouette_box(self.train, where=self._config.data)
+            if phase == "teacher":
+                return first_teacher(self.train, box, self._teacher, self.rng, self.device)
+            return self._stage(phase, self._coarse(box))
+        field = before.snapshot()
         if isinstance(before, NetworkStage):
             assert isinstance(before.network, OSF)
-            student = first_student(before.network, field, self._images, across=r.fine_across, cells=r.cells,
-                                    hidden=r.hidden, rng=self._rng)  # fmt: skip
-            return Distillation(student, before.network, self._device)
+            student = first_student(before.network, field, self.train, across=r.fine_across, cells=r.cells,
+                                    hidden=r.hidden, rng=self.rng)  # fmt: skip
+            return Distillation(student, before.network, self.device)
         if not isinstance(before, Distillation):
-            field = refine(field, self._images, across=r.fine_across, rng=self._rng)
-        return self._stage(name, field)
+            field = refine(field, self.train, across=r.fine_across, rng=self.rng)
+        return self._stage(phase, field)
 
-    def _share(self) -> float:
-        """Return the share of the whole budget that is used up."""
-        if self._config.iterations is not None:
-            return min(1.0, self._clock["steps"] / self._config.iterations)
-        return min(1.0, self._clock["seconds"] / (60 * self._config.minutes))
+    def _coarse(self, box: Float[np.ndarray, "2 3"]) -> KiloOSF:
+        """Fill the visual hull, or what views agree on of a hollow object."""
+        r, hollow = self._recipe, self._config.hollow
+        across = r.hollow_across if hollow else r.coarse_across
+        field = first_shell(self.train, box, across=across, cells=r.cells, hidden=r.hidden,
+                            inside_g=r.solid_g, rng=self.rng)  # fmt: skip
+        if hollow:
+            field = open_hollows(field, self.train, fog_g=r.hollow_g)
+            field = without_fog(fit_voxels(field, self.train, steps=r.hollow_steps, rays=r.rays, rng=self.rng))
+        return field
 
-    def _descend(self, name: str, learner: _Learner, start: float, end: float) -> Iterator[FieldStep]:
-        clock, already = self._pace.clock, self._clock["seconds"]
-        count = self._teacher.rays if isinstance(learner, NetworkStage) else self._recipe.rays
-        began = reported = saved = clock()
-        while (share := self._share()) < end:
-            rays = self._source.batch(self._rng.choice(self._pixels, count))
-            learner.step(rays, (share - start) / (end - start), self._rng, self._generator)
-            now = clock()
-            self._clock |= {"steps": self._clock["steps"] + 1, "seconds": already + now - began}
-            if now - reported > self._pace.report_s:
-                reported = now
-                yield self._look(learner)
-            if now - saved > self._pace.checkpoint_s:
-                saved = now
-                self._save(name, learner)
-            began += clock() - now  # looking and saving cost nobody's budget
+    def _stage(self, phase: str, field: KiloOSF) -> Stage:
+        r = self._recipe
+        return Stage(field, r.coarse_rates if phase == "coarse" else r.fine_rates, self.device)
 
-    def _look(self, learner: _Learner) -> FieldStep:
-        preview, seconds = None, self._clock["seconds"]
-        if seconds - self._clock["looked_at"] > max(_MIN_LOOK_S, _LOOK_SHARE * 60 * self._config.minutes):
-            network = learner.network if isinstance(learner, NetworkStage) else None
-            look = Holdout(self._test, network).glance(learner.snapshot())
-            self._clock |= {"looked_at": seconds, "psnr": (look.psnr_full, look.psnr_mask)}
-            preview = look.preview
-        share, psnr = self._share(), self._clock["psnr"]
-        minutes, rest = divmod(round(seconds * (1 / share - 1) if share else 0.0), 60)
-        quality = f"{psnr[0]:.1f} dB held out ({psnr[1]:.1f} in the mask), " if psnr else ""
-        left = f"{minutes} min {rest} s" if minutes else f"{rest} s"
-        return replace(self._report(f"{quality}{left} left"), preview=preview)
+    def resumed(self, saved: Checkpoint) -> Learner:
+        if saved.stage == "teacher":
+            return restored_teacher(saved.field, saved.optimiser, self._teacher, self.device)
+        if saved.stage == "distil":
+            return Distillation.restored(saved.field, saved.optimiser, self._teacher.size, self.device)
+        stage = self._stage(saved.stage, saved.field)
+        stage.restore(saved.optimiser)
+        return stage
 
-    def _report(self, words: str) -> FieldStep:
-        total = _total(self._config)
-        full, mask = self._clock["psnr"] or (None, None)
-        return FieldStep(Progress(round(self._share() * total), total, words), full, mask, None)
-
-    def _finish(self, field: KiloOSF) -> FieldStep:
-        """Measure what users will read from the file, and write it once it is known to be sound."""
-        config, data = self._config, self._trimmed(field)
-        look = Holdout(self._test).everything(field_from_bytes(data, "The trained field"))
-        metrics = {
-            "psnr_full": round(look.psnr_full, 3),
-            "psnr_mask": round(look.psnr_mask, 3),
-            "test_images": look.images,
-            "bytes": len(data),
-            "minutes": round(self._clock["seconds"] / 60, 3),
-            "iterations": self._clock["steps"],
-            "seed": config.seed,
-            "device": str(self._device),
-            "threads": torch.get_num_threads(),
-            "data": config.data.name,
-            "train_images": len(self._images.cameras),
-            "image_size": list(self._source.image_shape),
-            "hollow": config.hollow,
-            "lit": config.lit,
-            "recipe": {"name": config.recipe, **asdict(self._recipe)},
-        }
-        if config.recipe == "distil":
-            metrics["teacher"] = asdict(self._teacher)
-        write_atomically(config.out, data)
-        write_json(config.out.with_suffix(".json"), metrics)
-        self._checkpoint_path.unlink(missing_ok=True)
-        words = f"{look.psnr_full:.2f} dB held out, {look.psnr_mask:.2f} dB in the mask, {len(data) / 1e6:.2f} MB"
-        total = _total(config)
-        return FieldStep(Progress(total, total, words), look.psnr_full, look.psnr_mask, look.preview)
+    def finished(self, learner: Learner) -> tuple[bytes, Look, dict[str, Any]]:
+        config, data = self._config, self._trimmed(learner.snapshot())
+        look = Holdout(self.test).everything(field_from_bytes(data, "The trained field"))
+        recipe = {"name": config.recipe, **asdict(self._recipe)}
+        teacher = {"teacher": asdict(self._teacher)} if config.recipe == "distil" else {}
+        return data, look, {"hollow": config.hollow, "lit": config.lit, "recipe": recipe, **teacher}
 
     def _trimmed(self, field: KiloOSF) -> bytes:
         """Return the field as a file of at most the size aimed at, if leaving out what hardly shows can make it so."""
         data = b""
         field = field if self._config.lit else without_light(field)
         for needed_weight in _NEEDED_WEIGHTS:
-            data = field_bytes(trim(field, self._images, needed_weight))
+            data = field_bytes(trim(field, self.train, needed_weight))
             if len(data) <= _AIMED_BYTES:
                 break
         return data
-
-    def _save(self, name: str, learner: _Learner) -> None:
-        random = {"numpy": self._rng.bit_generator.state, "torch": self._generator.get_state()}
-        checkpoint = Checkpoint(name, learner.snapshot(), learner.state(), dict(self._clock), random)
-        checkpoint.write(self._checkpoint_path, self._fingerprint)
-
-    def _resumed(self, saved: Checkpoint) -> _Learner:
-        if saved.stage == "teacher":
-            learner = restored_teacher(saved.field, saved.optimiser, self._teacher, self._device)
-        elif saved.stage == "distil":
-            learner = Distillation.restored(saved.field, saved.optimiser, self._teacher.size, self._device)
-        else:
-            learner = self._stage(saved.stage, saved.field)
-            learner.restore(saved.optimiser)
-        self._clock = {name: saved.clock[name] for name in self._clock}
-        self._rng.bit_generator.state = saved.random["numpy"]
-        self._generator.set_state(saved.random["torch"])
-        return learner

@@ -1,15 +1,18 @@
 """Training an OSF from images by volume rendering: the first of the paper's three steps to a KiloOSF.
 
-Holds what every training of a field shares: stages of gradient descent, measuring on unseen images, and checkpoints.
+Holds what every training of a field shares: stages of gradient descent, measuring on unseen images, checkpoints, and
+the training of several stages one after the other.
 """
 
 from __future__ import annotations
 
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -18,16 +21,19 @@ from scipy import ndimage
 from torch import Tensor, nn
 from torch.nn import functional
 
-from osfcore.errors import InvalidInput
+from osfcore.errors import CorruptFile, InvalidInput, check_seed
 from osfcore.fields.kiloosf import DENSITY_FLOOR, EMPTY_G, FEATURES, FLOOR_G, KiloOSF
 from osfcore.fields.kiloosf_query import KiloQuery, Scatter
 from osfcore.fields.osf import OSF, OSFSize
 from osfcore.fields.rays import RayBatch, RaySource, first_shell, reshelled
 from osfcore.fields.volume_rendering import composite
 from osfcore.io.checkpoint import going_on_from, read_content, write_checkpoint
+from osfcore.io.files import write_atomically, write_json
 from osfcore.io.image_file import to_uint8
-from osfcore.io.image_set import ImageSet
+from osfcore.io.image_set import ImageSet, read_splits
+from osfcore.io.output_paths import check_weights_place
 from osfcore.metrics.image_errors import dilated
+from osfcore.progress import Progress
 
 # Gradient descent on a field from the pixels of an image set: one stage of training, step by step.
 
@@ -54,18 +60,6 @@ class Rates:
     def at(self, share: float) -> float:
         """Return the rate when `share` in [0, 1] of the stage is done."""
         return self.first * (self.last / self.first) ** share
-
-
-def check_budget(minutes: float, iterations: int | None) -> None:
-    """Refuse a budget of training that is out of range: of time, or of steps instead.
-
-    Raises:
-        InvalidInput: naming the one that is wrong.
-    """
-    if not 0.05 <= minutes <= 24 * 60:
-        raise InvalidInput("minutes", minutes, "between 0.05 and 1440")
-    if iterations is not None and not 10 <= iterations <= 10_000_000:
-        raise InvalidInput("iterations", iterations, "between 10 and 10,000,000")
 
 
 def descend(optimiser: torch.optim.Optimizer, loss: Float[Tensor, ""]) -> float:
@@ -132,6 +126,10 @@ class Stage:
     def snapshot(self) -> KiloOSF:
         """Return the field as it is now."""
         return self.query.to_field(self.field)
+
+    def glance(self, images: ImageSet) -> Look:
+        """Measure on a few of some images."""
+        return Holdout(images).glance(self.snapshot())
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint needs besides the field."""
@@ -298,6 +296,10 @@ class NetworkStage:
     def snapshot(self) -> KiloOSF:
         """Return the proposals: density alone means something in them."""
         return self._proposal
+
+    def glance(self, images: ImageSet) -> Look:
+        """Measure on a few of some images."""
+        return Holdout(images, self.network).glance(self._proposal)
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint needs besides the proposals."""
@@ -480,3 +482,257 @@ def restored_teacher(
     stage = NetworkStage(osf, proposal, state["hull"].numpy(), rates=recipe.rates, rebake=recipe.rebake)
     stage.restore(state)
     return stage
+
+
+# A whole training: phases that share a budget, and a checkpoint beside the output from which a killed run goes on.
+
+
+_LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
+_MIN_LOOK_S = 5.0
+_METRICS = ("psnr_full", "psnr_mask")  # by which a file of metrics is known
+
+
+@dataclass(frozen=True, slots=True)
+class FieldSettings:
+    """What is asked of any training of a field.
+
+    Attributes:
+        data: image set in the OSF format; `train` is learned from, `test` measured on.
+        out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
+        minutes: time budget of the descent [min].
+        device: "auto", "cpu" or "cuda".
+        seed: of everything random.
+        iterations: instead of the time budget, that many steps: repeatable on one machine.
+        teacher_width: units of each layer of the teacher.
+        teacher_depth: its layers.
+    """
+
+    data: Path
+    out: Path
+    minutes: float = 30.0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    seed: int = 0
+    iterations: int | None = None
+    teacher_width: int = 64
+    teacher_depth: int = 4
+
+    @property
+    def total(self) -> int:
+        """Steps of descent, or else seconds."""
+        return self.iterations or max(1, round(self.minutes * 60))
+
+    def check(self) -> None:
+        """Refuse what is out of range, and a place that cannot be written.
+
+        Raises:
+            InvalidInput: naming what is wrong, or if a file of somebody else lies where the metrics belong.
+            CannotWrite: if the output cannot be written.
+        """
+        if not 0.05 <= self.minutes <= 24 * 60:
+            raise InvalidInput("minutes", self.minutes, "between 0.05 and 1440")
+        if self.iterations is not None and not 10 <= self.iterations <= 10_000_000:
+            raise InvalidInput("iterations", self.iterations, "between 10 and 10,000,000")
+        OSFSize(self.teacher_depth, self.teacher_width)  # refuses what cannot be built
+        check_seed(self.seed)
+        check_weights_place(self.out, _METRICS)
+
+    def images(self) -> tuple[ImageSet, ImageSet]:
+        """Read the images to learn from, and those to measure on.
+
+        Raises:
+            CorruptFile: if the image set is not sound, or shows no object.
+        """
+        train, test = read_splits(self.data)
+        if train.is_opaque:
+            expected = "an object before a transparent background is expected (opaque sets show the bare table)"
+            raise CorruptFile(self.data, f"its images are opaque all over; {expected}")
+        return train, test
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How often a training reports; it does not change what is learned.
+
+    Attributes:
+        report_s: between two reports [s].
+        checkpoint_s: between two checkpoints [s].
+        clock: the time that counts for both and for the budget [s].
+    """
+
+    report_s: float = 1.0
+    checkpoint_s: float = 20.0
+    clock: Callable[[], float] = time.monotonic
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FieldStep:
+    """How far training is.
+
+    Attributes:
+        progress: in seconds of the budget (or steps), with PSNR and time left in words.
+        psnr_full: on held-out images, over black [dB]; None until measured.
+        psnr_mask: the same inside the silhouettes, dilated by 2 px [dB].
+        preview: one held-out image: truth, ours, difference x 4; None between looks.
+    """
+
+    progress: Progress
+    psnr_full: float | None = None
+    psnr_mask: float | None = None
+    preview: UInt8[np.ndarray, "h w3 3"] | None = None
+
+
+class Learner(Protocol):
+    """One phase of a training between its steps."""
+
+    def step(self, rays: RayBatch, share: float, rng: np.random.Generator, generator: torch.Generator) -> float:
+        """Take one step of descent when `share` in [0, 1] of the phase is done, and return the loss."""
+        ...
+
+    def snapshot(self) -> KiloOSF:
+        """Return the field as it is now."""
+        ...
+
+    def glance(self, images: ImageSet) -> Look | None:
+        """Measure on a few of some images; None if there is nothing to show."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """Return what a checkpoint needs besides the field."""
+        ...
+
+
+class FieldTraining(ABC):
+    """A training of a field from images; subclasses say in which phases.
+
+    Args:
+        settings: what is asked for.
+        recipe: how the field learns; it belongs to what a checkpoint must agree with.
+        pace: how often to report.
+        device: that computes.
+        train: images to learn from.
+        test: images to measure on.
+    """
+
+    phases: Mapping[str, tuple[float, str]]  # when each ends [share of the budget], and what is reported before it
+
+    def __init__(
+        self, settings: FieldSettings, recipe: Mapping[str, Any], pace: Pace, device: torch.device,
+        train: ImageSet, test: ImageSet,
+    ) -> None:  # fmt: skip
+        self._settings, self._pace, self.device = settings, pace, device
+        self.train, self.test, self._source = train, test, RaySource(train)
+        self.rng = np.random.default_rng(settings.seed)
+        self._generator = torch.Generator(device).manual_seed(settings.seed)
+        self._clock: dict[str, Any] = {"seconds": 0.0, "steps": 0, "looked_at": 0.0, "psnr": None}
+        self._checkpoint_path = settings.out.with_suffix(".partial")
+        asked = {**asdict(settings), "data": str(settings.data.resolve()), "out": str(settings.out)}
+        digests = [train.digest(), test.digest()]
+        self._fingerprint = {"settings": asked, "recipe": dict(recipe), "images": digests}
+
+    @abstractmethod
+    def rays(self, phase: str) -> int:
+        """Return the pixels per step of descent."""
+
+    @abstractmethod
+    def begun(self, phase: str, before: Learner | None) -> Learner:
+        """Return the learner of a phase from that of the phase before, which is None before the first."""
+
+    @abstractmethod
+    def resumed(self, saved: Checkpoint) -> Learner:
+        """Return the learner that a checkpoint holds."""
+
+    @abstractmethod
+    def finished(self, learner: Learner) -> tuple[bytes, Look, dict[str, Any]]:
+        """Return the file of the field, what users will see of it on all held-out images, and further metrics."""
+
+    def steps(self) -> Iterator[FieldStep]:
+        """Descend phase by phase, from the checkpoint of a killed run if there is one, and write the field."""
+        saved = Checkpoint.read(self._checkpoint_path, self._fingerprint)
+        names, first, learner = list(self.phases), 0, None
+        if saved is not None:
+            with going_on_from(self._checkpoint_path):
+                first, learner = names.index(saved.stage), self.resumed(saved)
+                self._clock = {name: saved.clock[name] for name in self._clock}
+                self.rng.bit_generator.state = saved.random["numpy"]
+                self._generator.set_state(saved.random["torch"])
+            yield self._report("Going on from a checkpoint")
+        ends = [0.0, *(end for end, _ in self.phases.values())]
+        for number, name in list(enumerate(names))[first:]:
+            if learner is None or number > first:
+                yield self._report(self.phases[name][1])
+                learner = self.begun(name, learner)
+                if number:
+                    self._save(name, learner)
+            yield from self._descend(name, learner, ends[number], ends[number + 1])
+        assert learner is not None, "there is at least one phase"
+        yield self._report("Measuring on all held-out images")
+        yield self._finish(learner)
+
+    def _descend(self, name: str, learner: Learner, start: float, end: float) -> Iterator[FieldStep]:
+        clock, already, pixels = self._pace.clock, self._clock["seconds"], self._source.silhouette_pixels()
+        began = reported = saved = clock()
+        while (share := self._share()) < end:
+            rays = self._source.batch(self.rng.choice(pixels, self.rays(name)))
+            learner.step(rays, (share - start) / (end - start), self.rng, self._generator)
+            now = clock()
+            self._clock |= {"steps": self._clock["steps"] + 1, "seconds": already + now - began}
+            if now - reported > self._pace.report_s:
+                reported = now
+                yield self._look(learner)
+            if now - saved > self._pace.checkpoint_s:
+                saved = now
+                self._save(name, learner)
+            began += clock() - now  # looking and saving cost nobody's budget
+
+    def _share(self) -> float:
+        """Return the share of the whole budget that is used up."""
+        if self._settings.iterations is not None:
+            return min(1.0, self._clock["steps"] / self._settings.iterations)
+        return min(1.0, self._clock["seconds"] / (60 * self._settings.minutes))
+
+    def _look(self, learner: Learner) -> FieldStep:
+        look, seconds = None, self._clock["seconds"]
+        if seconds - self._clock["looked_at"] > max(_MIN_LOOK_S, _LOOK_SHARE * 60 * self._settings.minutes):
+            look = learner.glance(self.test)
+            if look is not None:
+                self._clock |= {"looked_at": seconds, "psnr": (look.psnr_full, look.psnr_mask)}
+        share, psnr = self._share(), self._clock["psnr"]
+        minutes, rest = divmod(round(seconds * (1 / share - 1) if share else 0.0), 60)
+        quality = f"{psnr[0]:.1f} dB held out ({psnr[1]:.1f} in the mask), " if psnr else ""
+        left = f"{minutes} min {rest} s" if minutes else f"{rest} s"
+        return replace(self._report(f"{quality}{left} left"), preview=None if look is None else look.preview)
+
+    def _report(self, words: str) -> FieldStep:
+        full, mask = self._clock["psnr"] or (None, None)
+        return FieldStep(Progress(round(self._share() * self._settings.total), self._settings.total, words), full, mask)
+
+    def _save(self, name: str, learner: Learner) -> None:
+        random = {"numpy": self.rng.bit_generator.state, "torch": self._generator.get_state()}
+        checkpoint = Checkpoint(name, learner.snapshot(), learner.state(), dict(self._clock), random)
+        checkpoint.write(self._checkpoint_path, self._fingerprint)
+
+    def _finish(self, learner: Learner) -> FieldStep:
+        """Write the field once it is known to be sound, and its metrics beside it."""
+        settings = self._settings
+        data, look, further = self.finished(learner)
+        metrics = {
+            "psnr_full": round(look.psnr_full, 3),
+            "psnr_mask": round(look.psnr_mask, 3),
+            "test_images": look.images,
+            "bytes": len(data),
+            "minutes": round(self._clock["seconds"] / 60, 3),
+            "iterations": self._clock["steps"],
+            "seed": settings.seed,
+            "device": str(self.device),
+            "threads": torch.get_num_threads(),
+            "data": settings.data.name,
+            "train_images": len(self.train.cameras),
+            "image_size": list(self._source.image_shape),
+            **further,
+        }
+        write_atomically(settings.out, data)
+        write_json(settings.out.with_suffix(".json"), metrics)
+        self._checkpoint_path.unlink(missing_ok=True)
+        words = f"{look.psnr_full:.2f} dB held out, {look.psnr_mask:.2f} dB in the mask, {len(data) / 1e6:.2f} MB"
+        progress = Progress(settings.total, settings.total, words)
+        return FieldStep(progress, look.psnr_full, look.psnr_mask, look.preview)

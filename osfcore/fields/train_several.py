@@ -12,36 +12,20 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import Field, asdict, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 from osfcore.errors import OsfError, WorkerDied
 from osfcore.fields.devices import computing_threads
-from osfcore.fields.train_kiloosf import FieldStep
+from osfcore.fields.train_osf import FieldSettings, FieldStep
 from osfcore.io.files import write_atomically, write_json
 from osfcore.io.image_set import read_splits
 from osfcore.progress import Progress
 
 _MADE_OF = "made_of"  # key of the metrics by which a finished training is known
 TrainOne = Callable[[Any], Iterator[FieldStep]]
-
-
-class FieldSettings(Protocol):
-    """The settings of one training: a dataclass, such as `TrainField`, with a device besides."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-    @property
-    def data(self) -> Path:
-        """The image set."""
-        ...
-
-    @property
-    def out(self) -> Path:
-        """FILE.safetensors; metrics go beside it to FILE.json."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

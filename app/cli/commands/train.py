@@ -18,8 +18,8 @@ from osfcore.errors import InvalidInput
 from osfcore.io.output_paths import SUFFIX
 
 if TYPE_CHECKING:
-    from osfcore.fields.train_kiloosf import FieldStep
-    from osfcore.fields.train_several import FieldSettings, TrainOne
+    from osfcore.fields.train_osf import FieldSettings, FieldStep
+    from osfcore.fields.train_several import TrainOne
     from osfcore.progress import Progress
 
 
@@ -105,12 +105,13 @@ class TrainFieldCommand:
         return [TrainField(data, out, **given) for data, out in places], train_field
 
     def _paper(self, places: Sequence[tuple[Path, Path]]) -> tuple[Sequence[FieldSettings], TrainOne]:
-        from osfcore.paper.train_fields import TrainPaperField, train_paper_field
+        from osfcore.fields.train_osf import FieldSettings
+        from osfcore.paper.train_fields import train_paper_field
 
         for option, is_given in (("--hollow", self.hollow), ("--recipe", self.recipe != "direct")):
             if is_given:
                 raise InvalidInput(f"option {option}", "given", "left out with --method paper, which has no such thing")
-        return [TrainPaperField(data, out, **self._common()) for data, out in places], train_paper_field
+        return [FieldSettings(data, out, **self._common()) for data, out in places], train_paper_field
 
     def _common(self) -> dict[str, Any]:
         names = ("minutes", "device", "seed", "iterations", "teacher_width", "teacher_depth")

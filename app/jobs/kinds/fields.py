@@ -23,7 +23,7 @@ from osfcore.paper.method import Method, own_field_path
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
-    from osfcore.fields.train_kiloosf import FieldStep
+    from osfcore.fields.train_osf import FieldStep
 
 PREVIEW, COMPARISON = "preview.png", "comparison.png"
 _COMPARING = "Comparing it with the field that is there"
@@ -191,9 +191,10 @@ def _learning(params: dict[str, Any], data: Path, out: Path) -> Iterator[FieldSt
     """The training of the method that is asked for."""
     minutes, seed = params["minutes"], params["seed"]
     if params.get("method") == "paper":
-        from osfcore.paper.train_fields import TrainPaperField, train_paper_field
+        from osfcore.fields.train_osf import FieldSettings
+        from osfcore.paper.train_fields import train_paper_field
 
-        return train_paper_field(TrainPaperField(data, out, minutes=minutes, seed=seed))
+        return train_paper_field(FieldSettings(data, out, minutes=minutes, seed=seed))
     from osfcore.fields.train_kiloosf import TrainField, train_field
 
     return train_field(TrainField(data, out, minutes=minutes, seed=seed, hollow=params["hollow"]))

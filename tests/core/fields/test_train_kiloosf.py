@@ -17,8 +17,8 @@ from osfcore.fields.kiloosf import FLOOR_G, read_field
 from osfcore.fields.kiloosf_query import KiloQuery, Scatter
 from osfcore.fields.osf import OSF, OSFSize
 from osfcore.fields.rays import RaySource, first_shell
-from osfcore.fields.train_kiloosf import Distillation, Pace, TrainField, first_student, train_field
-from osfcore.fields.train_osf import corners
+from osfcore.fields.train_kiloosf import Distillation, TrainField, first_student, train_field
+from osfcore.fields.train_osf import Pace, corners
 from osfcore.fields.visual_hull import silhouette_box
 from osfcore.io.image_set import read_image_set
 from osfcore.render.renderer import SceneRenderer
@@ -96,7 +96,8 @@ def test_the_same_seed_gives_the_same_field(block_set, tmp_path):
 _KILLED = """
 import sys
 from pathlib import Path
-from osfcore.fields.train_kiloosf import Pace, TrainField, train_field
+from osfcore.fields.train_kiloosf import TrainField, train_field
+from osfcore.fields.train_osf import Pace
 from tests.support.rendered_sets import QUICK
 config = TrainField(Path(sys.argv[1]), Path(sys.argv[2]), iterations=240, device="cpu")
 for step in train_field(config, QUICK, Pace(0.2, 0.2)):

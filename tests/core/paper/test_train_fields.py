@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.fields.train_osf import Rates, TeacherRecipe
+from osfcore.fields.train_osf import FieldSettings, Pace, Rates, TeacherRecipe
 from osfcore.paper.fields import read_field
-from osfcore.paper.train_fields import PaperFieldRecipe, TrainPaperField, train_paper_field
+from osfcore.paper.train_fields import PaperFieldRecipe, train_paper_field
 from tests.support.rendered_sets import painted_block, write_object_set
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -23,7 +23,7 @@ def block_set(tmp_path_factory):
 
 
 def config_in(folder, data, iterations=240, **kwargs):
-    return TrainPaperField(data, folder / "a.safetensors", iterations=iterations, device="cpu", teacher_width=32,
+    return FieldSettings(data, folder / "a.safetensors", iterations=iterations, device="cpu", teacher_width=32,
                            teacher_depth=2, **kwargs)  # fmt: skip
 
 
@@ -46,11 +46,11 @@ def test_teacher_distillation_and_fine_tuning_learn_a_block(block_set, tmp_path)
 def test_a_killed_training_goes_on_where_it_was(block_set, tmp_path, kept):
     """A run that is left within a phase and begun again ends with the weights of an unbroken one."""
     whole, parted = tmp_path / "whole", tmp_path / "parted"
-    recipe = replace(QUICK, teacher_share=0.4, distil_share=0.2, report_s=0.0, checkpoint_s=0.0)
+    recipe = replace(QUICK, teacher_share=0.4, distil_share=0.2)
     list(train_paper_field(config_in(whole, block_set, 50), recipe))
     config = config_in(parted, block_set, 50)
     begin = {"teacher": 0, "distil": 20, "fine": 30}[kept]
-    steps = train_paper_field(config, recipe)
+    steps = train_paper_field(config, recipe, Pace(0.0, 0.0))
     for step in steps:
         if step.progress.done > begin + 3:
             break

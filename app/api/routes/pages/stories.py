@@ -30,7 +30,7 @@ class StoryOut(BaseModel):
     light_off_deg: float = Field(description="Error of the first estimate of the light [deg].")
     outcome: Literal["reached", "out of steps", "refused"]
     goal_image: str = Field(description="Path of the goal image, below the page's own.")
-    now_image: str = Field(description="Likewise of what the goal camera saw after each step: square pictures, row by row.")
+    now_image: str = Field(description="Likewise of what the goal camera saw after each step: squares, row by row.")
     now_columns: int = Field(description="Pictures in each row of it.")
 
 
