@@ -15,16 +15,23 @@ from beartype import beartype
 
 _SOURCE = Path(__file__).parent.parent
 _ARRAY = re.compile(r"\b(Float|Int|UInt|Bool|Shaped)\d*\[")
+_WORD = re.compile(r"\w+")
 
 
 def checked(function):
     """The function with its arrays checked."""
     hints = getattr(function, "__annotations__", {})
-    arrays = {name: hint for name, hint in hints.items() if _ARRAY.search(str(hint))}
+    known = getattr(function, "__globals__", {})
+    arrays = {name: hint for name, hint in hints.items() if _is_array(str(hint), known)}
     if function.__name__ == "__init__" or not arrays:
         return function
     function.__annotations__ = arrays
     return beartype(function)
+
+
+def _is_array(hint: str, known: dict[str, object]) -> bool:
+    """Whether an annotation names arrays, by jaxtyping or by a name that a module has given such a type."""
+    return bool(_ARRAY.search(hint)) or any(hasattr(known.get(word), "dim_str") for word in _WORD.findall(hint))
 
 
 @pytest.fixture(autouse=True)
