@@ -73,7 +73,18 @@ def bench_estimate(config: BenchEstimate, fields: FieldLibrary, assets: AssetLib
     """
     import numba
 
-    names, cameras, total = _checked_names(config, fields, assets), default_cameras(config.size), config.scenes
+    check_seed(config.seed)
+    check_ranges(
+        ("number of scenes", config.scenes, 1, MAX_TASKS),
+        ("later frames of each scene", config.steps, 1, MAX_TASKS),
+        ("objects in a scene", config.objects, 1, MAX_OBJECTS),
+    )
+    there = measurable(fields, assets)
+    names = tuple(name for name in there if name in DEFAULT_NAMES)
+    names = names if len(names) >= config.objects else there
+    if len(names) < config.objects:
+        raise InvalidInput("objects in a scene", config.objects, f"at most {len(names)}, which have field and mesh")
+    cameras, total = default_cameras(config.size), config.scenes
     yield EvaluationStep(0, total, "Warming up")
     draw = draw_scene(names, config.objects, config.seed, WARM_SCENE)
     models = warm_models(names, fields, assets, draw, config.size)
@@ -112,19 +123,3 @@ def _timed(steps: Iterator[EstimateStep], seconds: list[float]) -> SceneState:
     estimate = last_estimate(steps)
     seconds.append(time.perf_counter() - start)
     return estimate.state
-
-
-def _checked_names(config: BenchEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    check_ranges(
-        ("number of scenes", config.scenes, 1, MAX_TASKS),
-        ("later frames of each scene", config.steps, 1, MAX_TASKS),
-        ("objects in a scene", config.objects, 1, MAX_OBJECTS),
-    )
-    check_seed(config.seed)
-    there = measurable(fields, assets)
-    names = tuple(name for name in there if name in DEFAULT_NAMES)
-    if len(names) < config.objects:
-        names = there
-    if len(names) < config.objects:
-        raise InvalidInput("objects in a scene", config.objects, f"at most {len(names)}, which have field and mesh")
-    return names

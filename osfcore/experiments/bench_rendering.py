@@ -8,8 +8,8 @@ every timed scene is new: poses, light and pusher have not been drawn before. Ob
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,21 +34,6 @@ from osfcore.render.types import EXACT, PLANNING, Quality, SceneBatch
 from osfcore.world.physics import lowest_point
 from osfcore.world.scenes import random_rest
 from osfcore.world.tiny_renderer import TinyScene
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """Time of a call at one size.
-
-    Attributes:
-        size: number of objects, side of the image [px], or scenes in a batch.
-        ms: median time of a call [ms].
-        ms_per_image: the same for each image [ms].
-    """
-
-    size: int
-    ms: float
-    ms_per_image: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -77,7 +62,6 @@ def slope(sizes: Sequence[float], costs: Sequence[float]) -> float | None:
 
 
 NEW_SCENE_QUALITY: Quality = EXACT  # one ray a pixel, as TinyRenderer
-PLANNING_QUALITY: Quality = PLANNING
 OBJECTS = 3
 CANDIDATES, STEPS = 64, 10
 STEP_M, TURN_RAD = 0.015, 0.1  # what a push does to an object within one step
@@ -130,24 +114,22 @@ def bench_render(
     check_seed(config.seed)
     parts = ("new scenes", "planning", "the reference", "numbers of objects", "resolutions", "batches")
 
-    def step(number: int) -> EvaluationStep[RenderReport]:
-        return EvaluationStep(number, len(parts), f"Measuring {parts[number]}")
-
     yield EvaluationStep(0, len(parts), "Compiling")
     stage = _Stage(config, fields, assets)
-    stage.warm_up()
-    yield step(0)
-    (tiny_ms, exact_ms, planning_ms), shown = stage.new_scenes()
-    yield step(1)
-    renders_per_s, planning_psnr = stage.planning()
-    yield step(2)
-    reference_ms = stage.reference()
-    yield step(3)
-    objects = [stage.cost(n, n, config.side, 1, NEW_SCENE_QUALITY) for n in config.counts]
-    yield step(4)
-    resolution = [stage.cost(side, OBJECTS, side, 1, NEW_SCENE_QUALITY) for side in config.sides]
-    yield step(5)
-    batch = [stage.cost(n, OBJECTS, config.side, n, PLANNING_QUALITY) for n in config.batches]
+    measures: tuple[Callable[[], Any], ...] = (
+        stage.new_scenes,
+        stage.planning,
+        stage.reference,
+        lambda: [stage.cost(n, n, config.side, 1, NEW_SCENE_QUALITY) for n in config.counts],
+        lambda: [stage.cost(side, OBJECTS, side, 1, NEW_SCENE_QUALITY) for side in config.sides],
+        lambda: [stage.cost(n, OBJECTS, config.side, n, PLANNING) for n in config.batches],
+    )
+    found = []
+    for number, (part, measure) in enumerate(zip(parts, measures, strict=True)):
+        yield EvaluationStep(number, len(parts), f"Measuring {part}")
+        found.append(measure())
+    ((tiny_ms, exact_ms, planning_ms), shown), (renders_per_s, planning_psnr), reference_ms = found[:3]
+    objects, resolution, batch = found[3:]
     figures = {
         "tinyrenderer_ms": tiny_ms,
         "scene_exact_ms": exact_ms,
@@ -158,13 +140,13 @@ def bench_render(
         "planning_psnr": planning_psnr,
         "reference_ms": reference_ms,
         "threads": int(numba.get_num_threads()),
-        "by_objects": [asdict(cost) for cost in objects],
-        "by_resolution": [asdict(cost) for cost in resolution],
-        "by_batch": [asdict(cost) for cost in batch],
+        "by_objects": objects,
+        "by_resolution": resolution,
+        "by_batch": batch,
         "growth": {
-            "objects": slope([c.size for c in objects], [c.ms for c in objects]),
-            "pixels": slope([c.size**2 for c in resolution], [c.ms for c in resolution]),
-            "batch": slope([c.size for c in batch], [c.ms for c in batch]),
+            "objects": slope([c["size"] for c in objects], [c["ms"] for c in objects]),
+            "pixels": slope([c["size"] ** 2 for c in resolution], [c["ms"] for c in resolution]),
+            "batch": slope([c["size"] for c in batch], [c["ms"] for c in batch]),
         },
     }
     yield EvaluationStep(len(parts), len(parts), "Everything is measured", RenderReport(figures, shown))
@@ -225,11 +207,8 @@ class _Stage:
         self._assets = {name: asset for name, (_, asset) in both.items()}
         self._table = fields.load_table()
         self._ours = SceneRenderer(self._fields, self._table)
-
-    def warm_up(self) -> None:
-        """Compile code for every quality."""
-        state, camera = self._scene(OBJECTS), default_cameras(self._config.side)[0]
-        for quality in (NEW_SCENE_QUALITY, PLANNING_QUALITY):
+        state, camera = self._scene(OBJECTS), default_cameras(config.side)[0]  # compiles code for every quality
+        for quality in (NEW_SCENE_QUALITY, PLANNING):
             self._ours.render(SceneBatch.of(state), (camera,), quality=quality)
             self._ours.render(SceneBatch.of(replace(state, pusher=None)), (camera,), quality=quality)
 
@@ -247,7 +226,7 @@ class _Stage:
                 second = time.perf_counter()
                 ours = self._ours.render(batch, views, quality=NEW_SCENE_QUALITY)
                 third = time.perf_counter()
-                self._ours.render(batch, views, quality=PLANNING_QUALITY)
+                self._ours.render(batch, views, quality=PLANNING)
                 times.append((second - start, third - second, time.perf_counter() - third))
                 if len(shown) < len(cameras):
                     pair = to_uint8(theirs[0].rgb), to_uint8(ours.rgb[0, 0])
@@ -265,7 +244,7 @@ class _Stage:
             state = self._scene(OBJECTS)
             batch = rollouts(state.poses, state.light, state.names, self._rng, CANDIDATES, STEPS)
             start = time.perf_counter()
-            images = self._ours.render(batch, camera, quality=PLANNING_QUALITY).rgb
+            images = self._ours.render(batch, camera, quality=PLANNING).rgb
             times.append(time.perf_counter() - start)
             if number == 0:
                 chosen = np.arange(0, CANDIDATES * STEPS, CANDIDATES)
@@ -289,8 +268,8 @@ class _Stage:
         render_reference(self._fields, self._table, state, camera, quality=NEW_SCENE_QUALITY)
         return 1000 * (time.perf_counter() - start)
 
-    def cost(self, size: int, count: int, side: int, scenes: int, quality: Quality) -> Cost:
-        """Return the median time of a call.
+    def cost(self, size: int, count: int, side: int, scenes: int, quality: Quality) -> dict[str, float]:
+        """Return the "size" that a cost is noted for, and the median time of a call "ms" and "ms_per_image" [ms].
 
         Args:
             size: that the cost is noted for.
@@ -309,7 +288,7 @@ class _Stage:
             self._ours.render(batch, (camera,), quality=quality)
             times.append(time.perf_counter() - start)
         ms = 1000 * float(np.median(times))
-        return Cost(size, ms, ms / scenes)
+        return {"size": size, "ms": ms, "ms_per_image": ms / scenes}
 
     def _batch(self, count: int, scenes: int) -> SceneBatch:
         parts = [self._arrangement(count) for _ in range(scenes)]

@@ -19,8 +19,7 @@ from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp, rotation_angle
 from osfcore.io.image_file import to_uint8
-from osfcore.photo.board import Board, BoardView, locate_board, page_image
-from osfcore.photo.lens import locate_board_through_lens
+from osfcore.photo.board import Board, BoardView, locate_board, locate_board_through_lens, page_image
 
 _DISTANCES_M = (0.4, 1.0)
 _ELEVATIONS_DEG = (25.0, 80.0)
@@ -122,7 +121,12 @@ def board_photograph(
     pixels_per_m = _PAGE_STEP * math.ceil(4 * intrinsics[0, 0] / _DISTANCES_M[0] / _PAGE_STEP)
     paper = page_image(board or Board(), pixels_per_m)  # what is paper, not ink
     width, height = size[0] * _SAMPLES, size[1] * _SAMPLES
-    warp = _raster_to_image(paper.shape, pixels_per_m, pose, intrinsics)
+    # From the print's pixels to the table, and on to the finely sampled image, both as OpenCV counts them.
+    rows, columns = paper.shape
+    to_table = np.array([[1, 0, -columns / 2], [0, -1, rows / 2], [0, 0, pixels_per_m]]) / pixels_per_m
+    centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    fine, to_camera = np.diag([_SAMPLES, _SAMPLES, 1.0]), pose.inverse().matrix()[:3, [0, 1, 3]]
+    warp = np.linalg.inv(centre) @ fine @ intrinsics @ to_camera @ to_table @ centre
     ink, white = _REFLECTANCES
     lens = _lens(size, intrinsics, radial)
     cover = _seen(np.ones(paper.shape, np.float32), warp, (width, height), lens)
@@ -130,8 +134,11 @@ def board_photograph(
     texture = rng.uniform(0.6, 1.4, (24, 32)).astype(np.float32)
     table = (1 - cover) * cv2.resize(texture, (width, height), interpolation=cv2.INTER_CUBIC)
     layers = [_reduced(layer, size, blur_px)[..., None] for layer in (print_light, table)]
-    light = (layers[0] + layers[1] * rng.uniform(0.15, 0.5, 3)) * _lighting(size, rng)[..., None]
-    light = np.clip(light, 0, 1)
+    light = layers[0] + layers[1] * rng.uniform(0.15, 0.5, 3)
+    (slope_x, slope_y), exposure = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.5, 1.05)  # it falls off across the image
+    across, down = ((np.arange(side) + 0.5) / side - 0.5 for side in size)
+    falloff = 1 + slope_x * across + slope_y * down[:, None]
+    light = np.clip(light * (exposure * falloff / falloff.max())[..., None], 0, 1)
     values = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     values += rng.normal(0, _NOISE, values.shape)
     file = io.BytesIO()
@@ -230,27 +237,6 @@ def _lens(
     return bent * (straight / np.maximum(distance, 1e-9)) * fine[[0, 1], [0, 1]] + fine[:2, 2] - 0.5
 
 
-def _raster_to_image(
-    shape: tuple[int, ...], pixels_per_m: float, pose: Pose, intrinsics: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "3 3"]:
-    """Return the homography from a print's pixels to the finely sampled image, both as OpenCV counts them."""
-    world_to_camera = pose.inverse().matrix()[:3]
-    height, width = shape
-    to_table = np.array([[1, 0, -width / 2], [0, -1, height / 2], [0, 0, pixels_per_m]]) / pixels_per_m
-    centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-    fine = np.diag([_SAMPLES, _SAMPLES, 1.0])
-    return np.linalg.inv(centre) @ fine @ intrinsics @ world_to_camera[:, [0, 1, 3]] @ to_table @ centre
-
-
 def _reduced(layer: Float[np.ndarray, "H W"], size: tuple[int, int], blur_px: float) -> Float[np.ndarray, "h w"]:
     """Blur a finely sampled layer by the lens, and average it over each pixel."""
     return cv2.resize(cv2.GaussianBlur(layer, (0, 0), blur_px * _SAMPLES), size, interpolation=cv2.INTER_AREA)
-
-
-def _lighting(size: tuple[int, int], rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
-    """Draw exposure, which falls off linearly across the image in some direction."""
-    slopes, exposure = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.5, 1.05)
-    across = (np.arange(size[0]) + 0.5) / size[0] - 0.5
-    down = (np.arange(size[1]) + 0.5) / size[1] - 0.5
-    falloff = 1 + slopes[0] * across + slopes[1] * down[:, None]
-    return exposure * falloff / falloff.max()

@@ -13,49 +13,245 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from dataclasses import fields as fields_of
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from osfcore.dynamics.dynamics_model import DynamicsModel
-from osfcore.dynamics.graph import read_metrics, read_network, shipped
-from osfcore.dynamics.motion import SUBSTEPS, pusher_path
+from osfcore.dynamics.graph import PropagationNetwork, read_metrics, read_network, shipped, unroll
+from osfcore.dynamics.motion import SUBSTEPS, Motion, going_on, is_on_table, lowest_point, pusher_path
 from osfcore.dynamics.rollout import PushModel, load_shapes, network_path
 from osfcore.dynamics.shapes import ObjectShape, ShapeTable, part_outlines
 from osfcore.dynamics.train import has_held_out_pair
 from osfcore.errors import InvalidInput
 from osfcore.experiments.bench_rollouts import BENCH_NAMES, bench_rollouts
 from osfcore.experiments.charts import Axis, Chart, Curve, write_charts
-from osfcore.experiments.dynamics_scores import (
-    HORIZONS,
-    LONGEST,
-    Errors,
-    Predicted,
-    Windows,
-    analytic,
-    constant,
-    errors,
-    learned,
-    windows_of,
-)
 from osfcore.experiments.harness import EvaluationStep, check_run, chosen_objects
+from osfcore.experiments.rivals.quasistatic import push
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.poses import Pose
+from osfcore.geometry.poses import Pose, rotate, rotation_angle
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
 from osfcore.inspection.contact_sheet import put_text
 from osfcore.io.files import write_json
 from osfcore.io.image_file import write_png
-from osfcore.io.push_file import read_pushes
+from osfcore.io.push_file import PushEpisode, read_pushes
+from osfcore.metrics.pose_errors import rotation_error
+from osfcore.objects.asset import Symmetry
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.paper.dynamics import GraphNetwork, PaperPushModel, Scenes, longest_axes, unroll, weights_path
-from osfcore.paper.dynamics import read_network as read_paper_network
+from osfcore.paper import dynamics as paper
 from osfcore.random_streams import Stream, stream_seed
 from osfcore.world.collect_pushes import CollectPushes, collect_pushes
+
+# What is rolled out, by whom, and how far it ends from the truth.
+
+
+HORIZONS = (1, 2, 3, 4, 6, 8, 10, 15, 20, 25, 30)
+LONGEST = HORIZONS[-1]
+MOVED_MM, MOVED_DEG = 10.0, 5.0  # what counts as truly moved within a window
+_START_EVERY = 4  # steps
+_CHUNK = 512  # windows
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Windows:
+    """Pieces of episodes with equally many objects: W windows of `LONGEST` actions.
+
+    Attributes:
+        names: of the objects of each window.
+        positions: true ones, one action before the start (or at it, where there was none), at the start, and after each
+            action [m].
+        quaternions: likewise.
+        pusher: likewise [m].
+        actions: velocities [m/s].
+        on_table: how many actions pass before something comes near the table's edge.
+    """
+
+    names: tuple[tuple[str, ...], ...]
+    positions: Float[np.ndarray, "W T2 N 3"]
+    quaternions: Float[np.ndarray, "W T2 N 4"]
+    pusher: Float[np.ndarray, "W T2 3"]
+    actions: Float[np.ndarray, "W T 3"]
+    on_table: Int[np.ndarray, "W"]
+
+    def chunks(self) -> Iterator[Windows]:
+        """Yield a few hundred windows at a time, to bound the memory that predictions take."""
+        for first in range(0, len(self.names), _CHUNK):
+            yield Windows(*(getattr(self, entry.name)[first : first + _CHUNK] for entry in fields_of(self)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Predicted:
+    """Poses of the objects after each action [m]."""
+
+    positions: Float[np.ndarray, "W T N 3"]
+    quaternions: Float[np.ndarray, "W T N 4"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Errors:
+    """How far one predictor ends from the truth, for every horizon, window and object.
+
+    Attributes:
+        mm: error of the position [mm].
+        deg: error of the orientation, by the object's symmetry [deg].
+        moved: whether the object truly moved.
+        valid: whether everything was on the table up to then.
+    """
+
+    mm: Float[np.ndarray, "H W N"]
+    deg: Float[np.ndarray, "H W N"]
+    moved: Bool[np.ndarray, "H W N"]
+    valid: Bool[np.ndarray, "H W N"]
+
+    def of_moved(
+        self, horizon: int, *, deg: bool = False, among: Bool[np.ndarray, "W N"] | bool = True
+    ) -> Float[np.ndarray, "M"]:
+        """Return errors of objects that truly moved within so many actions [mm or deg].
+
+        Args:
+            horizon: one of `HORIZONS`.
+            deg: errors of orientations instead of positions.
+            among: objects that count.
+        """
+        at = HORIZONS.index(horizon)
+        return (self.deg if deg else self.mm)[at][self.moved[at] & self.valid[at] & among]
+
+    def of_still(self, horizon: int) -> Float[np.ndarray, "M"]:
+        """Return position errors of objects that did not move [mm]."""
+        at = HORIZONS.index(horizon)
+        return self.mm[at][~self.moved[at] & self.valid[at]]
+
+
+def windows_of(episodes: Sequence[PushEpisode]) -> Windows:
+    """Cut episodes of one length and number of objects into windows."""
+    parts: list[tuple[object, ...]] = []
+    for e in episodes:
+        inside = is_on_table(e)
+        for start in range(0, len(e.actions) - LONGEST + 1, _START_EVERY):
+            steps = np.clip(np.arange(start - 1, start + LONGEST + 1), 0, None)
+            leaves = np.flatnonzero(~inside[start : start + LONGEST + 1])
+            last = int(leaves[0]) - 1 if len(leaves) else LONGEST
+            taken = e.actions[start : start + LONGEST]
+            parts.append((e.names, e.positions[steps], e.quaternions[steps], e.pusher[steps], taken, last))
+    names, *arrays = zip(*parts, strict=True)
+    return Windows(names, *(np.array(array) for array in arrays))  # pyright: ignore[reportArgumentType]
+
+
+def constant(windows: Windows) -> Predicted:
+    """Predict that nothing ever moves."""
+    shape = (len(windows.names), LONGEST, windows.positions.shape[2])
+    return Predicted(
+        np.broadcast_to(windows.positions[:, 1:2], (*shape, 3)),
+        np.broadcast_to(windows.quaternions[:, 1:2], (*shape, 4)),
+    )
+
+
+def learned(network: PropagationNetwork, shapes: Mapping[str, ObjectShape], windows: Windows) -> Predicted:
+    """Predict by the network, which knows the poses of one action before the start.
+
+    Args:
+        network: on the CPU.
+        shapes: of all objects in the windows, by name.
+        windows: what to predict.
+    """
+
+    def roll(table: ShapeTable, number: Tensor, part: Windows) -> Iterator[Motion]:
+        start = going_on(_at_rest(table, number, part, 0), _at_rest(table, number, part, 1))
+        velocity = torch.as_tensor(part.actions[..., :2], dtype=torch.float32).transpose(0, 1)
+        return islice(unroll(network, table, number, start, velocity), SUBSTEPS - 1, None, SUBSTEPS)
+
+    return _rolled(shapes, windows, roll)
+
+
+def analytic(shapes: Mapping[str, ObjectShape], windows: Windows) -> Predicted:
+    """Predict by the quasi-static model."""
+
+    def roll(table: ShapeTable, number: Tensor, part: Windows) -> Iterator[Motion]:
+        shifts = torch.as_tensor(np.diff(part.pusher[:, 1:, :2], axis=1), dtype=torch.float32)
+        return push(table, number, _at_rest(table, number, part, 1), shifts.transpose(0, 1))
+
+    return _rolled(shapes, windows, roll)
+
+
+def _rolled(
+    shapes: Mapping[str, ObjectShape], windows: Windows, roll: Callable[[ShapeTable, Tensor, Windows], Iterator[Motion]]
+) -> Predicted:
+    """Return poses after each action.
+
+    Args:
+        shapes: of all objects in the windows, by name.
+        windows: what to predict.
+        roll: yields motions after each action of some windows, given a table of shapes and the objects' numbers in it.
+    """
+    names = tuple(sorted(shapes))
+    table = ShapeTable(tuple(shapes[name] for name in names))
+    centres, turned = [], []
+    with torch.inference_mode():
+        for part in windows.chunks():
+            number = torch.tensor([[names.index(name) for name in row] for row in part.names])
+            motions = list(roll(table, number, part))
+            centres.append(torch.stack([motion.centre for motion in motions], dim=1).numpy())
+            turned.append(torch.stack([motion.quaternion for motion in motions], dim=1).numpy())
+    quaternions = np.concatenate(turned).astype(float)
+    offsets = np.array([[shapes[name].centre for name in row] for row in windows.names])[:, None]
+    return Predicted(np.concatenate(centres) - rotate(quaternions, offsets), quaternions)
+
+
+def _at_rest(table: ShapeTable, number: Tensor, windows: Windows, at: int) -> Motion:
+    """Return the scenes one action before the start (at = 0) or at it (1), without velocities."""
+    quaternion = torch.as_tensor(windows.quaternions[:, at], dtype=torch.float32)
+    offsets = table.centre[number].numpy()
+    centre = windows.positions[:, at] + rotate(windows.quaternions[:, at], offsets)
+    centre = torch.as_tensor(centre, dtype=torch.float32)
+    lowest = lowest_point(table, number.flatten(), centre.flatten(0, 1), quaternion.flatten(0, 1)).view(number.shape)
+    still = torch.zeros_like(centre)
+    pusher = torch.as_tensor(windows.pusher[:, at, :2], dtype=torch.float32)
+    return Motion(centre, quaternion, still, still, pusher, lowest.clamp(max=0))
+
+
+def errors(windows: Windows, predicted: Predicted, symmetries: Mapping[str, Symmetry]) -> Errors:
+    """Score a predictor at every horizon.
+
+    Args:
+        windows: with the truth.
+        predicted: for these windows.
+        symmetries: of all objects in them, by name.
+    """
+    at = np.array(HORIZONS)
+    true_p, true_q = (np.moveaxis(a[:, 1 + at], 1, 0) for a in (windows.positions, windows.quaternions))
+    p, q = (np.moveaxis(a[:, at - 1], 1, 0) for a in (predicted.positions, predicted.quaternions))
+    way_mm = 1e3 * np.linalg.norm(true_p - windows.positions[:, 1], axis=-1)
+    start = np.broadcast_to(windows.quaternions[:, 1], true_q.shape)
+    turned_deg = _angles(windows, symmetries, start, true_q)
+    valid = at[:, None] <= windows.on_table
+    return Errors(
+        mm=1e3 * np.linalg.norm(p - true_p, axis=-1),
+        deg=_angles(windows, symmetries, q, true_q),
+        moved=(way_mm > MOVED_MM) | (turned_deg > MOVED_DEG),
+        valid=np.broadcast_to(valid[..., None], way_mm.shape),
+    )
+
+
+def _angles(
+    windows: Windows, symmetries: Mapping[str, Symmetry], a: Float[np.ndarray, "H W N 4"], b: np.ndarray
+) -> Float[np.ndarray, "H W N"]:
+    """Return symmetry-aware angles between orientations [deg]."""
+    angles = np.asarray(rotation_angle(a, b))
+    for window, names in enumerate(windows.names):
+        for slot, name in enumerate(names):
+            if symmetries[name].kind != "none":
+                for h in range(len(HORIZONS)):
+                    place = (h, window, slot)
+                    angles[place] = rotation_error(symmetries[name], a[place], b[place])
+    return np.rad2deg(angles)
+
 
 # Whose predictions are evaluated: those of our model, or of the paper's as it is published.
 
@@ -93,11 +289,11 @@ def load_predictor(
     if method == "ours":
         network = read_network(network_path(data_dir))
         return Predictor(lambda windows: learned(network, shapes, windows), PushModel(network, shapes))
-    published, kappas = read_paper_network(weights_path(data_dir)), longest_axes(fields, shapes)
-    return Predictor(lambda windows: as_published(published, kappas, windows), PaperPushModel(published, kappas))
+    published, kappas = paper.read_network(paper.weights_path(data_dir)), paper.longest_axes(fields, shapes)
+    return Predictor(lambda windows: as_published(published, kappas, windows), paper.PaperPushModel(published, kappas))
 
 
-def as_published(network: GraphNetwork, kappas: Mapping[str, float], windows: Windows) -> Predicted:
+def as_published(network: paper.GraphNetwork, kappas: Mapping[str, float], windows: Windows) -> Predicted:
     """Predict by the paper's network, which looks at the poses at the start alone.
 
     Args:
@@ -112,9 +308,9 @@ def as_published(network: GraphNetwork, kappas: Mapping[str, float], windows: Wi
         path = pusher_path(part.pusher[:, 1, :2], part.actions[..., :2])[:, ::SUBSTEPS]
         height = np.broadcast_to(part.pusher[:, 1:2, 2:], (*path.shape[:2], 1))
         pusher = _tensor(np.concatenate([path, height], axis=-1))
-        start = Scenes(_tensor(part.positions[:, 1]), _tensor(part.quaternions[:, 1]), pusher[:, 0])
+        start = paper.Scenes(_tensor(part.positions[:, 1]), _tensor(part.quaternions[:, 1]), pusher[:, 0])
         with torch.inference_mode():
-            scenes = list(unroll(network, number, kappa, start, _tensor(part.actions), pusher))
+            scenes = list(paper.unroll(network, number, kappa, start, _tensor(part.actions), pusher))
             placed.append(torch.stack([s.position for s in scenes], dim=1).numpy())
             turned.append(torch.stack([s.quaternion for s in scenes], dim=1).numpy())
     return Predicted(np.concatenate(placed).astype(float), np.concatenate(turned).astype(float))
@@ -194,8 +390,24 @@ def report_json(report: DynamicsReport) -> dict[str, Any]:
     result["by_policy"] = {key.split()[0]: _row([s]) for key, s in report.by_set.items() if key.endswith(" 3")}
     names = sorted({name for s in main for row in s.windows.names for name in row})
     result["by_name"] = {name: _after_four(main, "network", lambda one, name=name: one == name) for name in names}
-    result["unseen_pairs"] = _pairs(list(report.by_set.values()) if report.holds_out_pairs else [])
-    return result | _unseen_figures(report)
+
+    def held_out(names: tuple[str, ...]) -> list[bool]:
+        return [has_held_out_pair(names)] * len(names)
+
+    every = list(report.by_set.values()) if report.holds_out_pairs else []
+    mm, way = (_moved(every, who, 4, chosen=held_out) for who in ("network", "constant"))
+    result["unseen_pairs"] = {"windows": len(mm), "median_mm_4": _median(mm), "constant_mm_4": _median(way)}
+    # What it costs never to have seen an object: errors in the same windows by both networks.
+    scored = [] if report.unseen is None else [report.unseen]
+    without, seen = (_after_four(scored, who, report.unseen_names.__contains__) for who in ("without", "network"))
+    return result | {
+        "unseen_objects": list(report.unseen_names if scored else ()),
+        "unseen_objects_windows": without["windows"],
+        "unseen_objects_mm_4": without["median_mm_4"],
+        "unseen_objects_deg_4": without["median_deg_4"],
+        "seen_objects_mm_4": seen["median_mm_4"],
+        "seen_objects_deg_4": seen["median_deg_4"],
+    }
 
 
 def _row(scored: Sequence[Scored]) -> dict[str, Any]:
@@ -219,30 +431,6 @@ def _after_four(scored: Sequence[Scored], who: str, is_chosen: Callable[[str], b
 
     mm, deg = (_moved(scored, who, 4, deg=deg, chosen=chosen) for deg in (False, True))
     return {"windows": len(mm), "median_mm_4": _median(mm), "median_deg_4": _median(deg)}
-
-
-def _pairs(scored: Sequence[Scored]) -> dict[str, Any]:
-    """Return errors in scenes in which two objects meet that never do in training."""
-
-    def chosen(names: tuple[str, ...]) -> list[bool]:
-        return [has_held_out_pair(names)] * len(names)
-
-    mm, way = (_moved(scored, who, 4, chosen=chosen) for who in ("network", "constant"))
-    return {"windows": len(mm), "median_mm_4": _median(mm), "constant_mm_4": _median(way)}
-
-
-def _unseen_figures(report: DynamicsReport) -> dict[str, Any]:
-    """Return what it costs never to have seen an object: errors in the same windows by both networks."""
-    scored = [] if report.unseen is None else [report.unseen]
-    without, seen = (_after_four(scored, who, report.unseen_names.__contains__) for who in ("without", "network"))
-    return {
-        "unseen_objects": list(report.unseen_names if scored else ()),
-        "unseen_objects_windows": without["windows"],
-        "unseen_objects_mm_4": without["median_mm_4"],
-        "unseen_objects_deg_4": without["median_deg_4"],
-        "seen_objects_mm_4": seen["median_mm_4"],
-        "seen_objects_deg_4": seen["median_deg_4"],
-    }
 
 
 def _moved(
@@ -441,19 +629,36 @@ def evaluate_dynamics(
         InvalidInput: if a number is out of range.
         CorruptFile, CannotWrite: as files are.
     """
-    names = _checked(config, fields, assets)
-    unseen = _unseen(config, names)
+    check_run(config.tasks, config.seed)
+    if config.method not in METHODS:
+        raise InvalidInput("method", repr(config.method), f"one of {', '.join(METHODS)}")
+    names = tuple(sorted(chosen_objects(config.names, fields, assets)))
+    if len(names) < min(COUNTS) + 1:
+        raise InvalidInput("number of objects with a field and a mesh", len(names), f"at least {min(COUNTS) + 1}")
+    # Objects that the second shipped network has not seen, as far as they are there; the paper's has none.
+    hidden = read_metrics(shipped(_SECOND_NETWORK)).get("without", ()) if config.method == "ours" else ()
+    unseen = tuple(name for name in hidden if name in names)
     sets = _sets(config, names, unseen)
     total = 2 * len(sets) + 1
     for done, entry in enumerate(sets):
-        for note in _collect(config, entry, assets, executor):
-            yield EvaluationStep(done, total, f"Pushes, {entry.objects} objects: {note}")
+        if not (path := _path(config, entry)).exists():
+            seed = stream_seed(config.seed, Stream.HELD_OUT_PUSHES, entry.objects, int(entry.policy == "paper"))
+            pushes = CollectPushes(path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names)
+            for step in collect_pushes(pushes, assets, executor):
+                yield EvaluationStep(done, total, f"Pushes, {entry.objects} objects: {step.note}")
     shapes = load_shapes(config.data_dir, fields, names)
     predictor = load_predictor(config.method, config.data_dir, fields, shapes)
     scored: dict[str, Scored] = {}
     for done, entry in enumerate(sets, len(sets)):
         yield EvaluationStep(done, total, f"Predicting {entry.policy} pushes of {entry.objects} objects")
-        scored[entry.key] = _score(config, entry, shapes, assets, predictor)
+        windows = windows_of(read_pushes(_path(config, entry)))
+        symmetries = {name: assets.info(name).symmetry for name in entry.names}
+        network = predictor.predict(windows)
+        predictions = {"network": network, "constant": constant(windows), "analytic": analytic(shapes, windows)}
+        if entry.key == _UNSEEN:
+            predictions["without"] = learned(read_network(shipped(_SECOND_NETWORK)), shapes, windows)
+        found = {who: errors(windows, predicted, symmetries) for who, predicted in predictions.items()}
+        scored[entry.key] = Scored(windows, network, found)
     yield EvaluationStep(total - 1, total, "Timing rollouts")
     bench_shapes = load_shapes(config.data_dir, fields, BENCH_NAMES)
     timed = load_predictor(config.method, config.data_dir, fields, bench_shapes).model
@@ -471,24 +676,6 @@ def evaluate_dynamics(
     yield EvaluationStep(total, total, "Everything is measured", figures)
 
 
-def _checked(config: EvaluateDynamics, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    """Check everything, and return the objects."""
-    check_run(config.tasks, config.seed)
-    if config.method not in METHODS:
-        raise InvalidInput("method", repr(config.method), f"one of {', '.join(METHODS)}")
-    names = tuple(sorted(chosen_objects(config.names, fields, assets)))
-    if len(names) < min(COUNTS) + 1:
-        raise InvalidInput("number of objects with a field and a mesh", len(names), f"at least {min(COUNTS) + 1}")
-    return names
-
-
-def _unseen(config: EvaluateDynamics, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return objects that the second shipped network has not seen, as far as they are there; the paper's has none."""
-    if config.method != "ours":
-        return ()
-    return tuple(name for name in read_metrics(shipped(_SECOND_NETWORK)).get("without", ()) if name in names)
-
-
 def _sets(config: EvaluateDynamics, names: tuple[str, ...], unseen: tuple[str, ...]) -> list[_Set]:
     sets = []
     for objects in (count for count in COUNTS if count <= len(names)):
@@ -500,27 +687,7 @@ def _sets(config: EvaluateDynamics, names: tuple[str, ...], unseen: tuple[str, .
     return sets
 
 
-def _collect(config: EvaluateDynamics, entry: _Set, assets: AssetLibrary, executor: Executor | None) -> Iterator[str]:
-    path = _path(config, entry)
-    if not path.exists():
-        seed = stream_seed(config.seed, Stream.HELD_OUT_PUSHES, entry.objects, int(entry.policy == "paper"))
-        collection = CollectPushes(path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names)
-        yield from (step.note for step in collect_pushes(collection, assets, executor))
-
-
 def _path(config: EvaluateDynamics, entry: _Set) -> Path:
     """Return where the episodes of a set are kept; the name holds all that they depend on, but for the simulator."""
     which = hashlib.sha256(" ".join(entry.names).encode()).hexdigest()[:8]
     return config.folder / f"pushes-{entry.key.replace(' ', '-')}-{entry.episodes}-{config.seed}-{which}.h5"
-
-
-def _score(
-    config: EvaluateDynamics, entry: _Set, shapes: Mapping[str, ObjectShape], assets: AssetLibrary, predictor: Predictor
-) -> Scored:
-    windows = windows_of(read_pushes(_path(config, entry)))
-    symmetries = {name: assets.info(name).symmetry for name in entry.names}
-    network = predictor.predict(windows)
-    predictions = {"network": network, "constant": constant(windows), "analytic": analytic(shapes, windows)}
-    if entry.key == _UNSEEN:
-        predictions["without"] = learned(read_network(shipped(_SECOND_NETWORK)), shapes, windows)
-    return Scored(windows, network, {key: errors(windows, p, symmetries) for key, p in predictions.items()})

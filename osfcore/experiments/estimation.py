@@ -21,10 +21,10 @@ from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float
 from scipy.special import erf
 
 from osfcore.errors import InvalidInput, OsfError
@@ -35,21 +35,7 @@ from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.tracking import TrackingConfig, estimate_next
 from osfcore.experiments import estimation_tasks as tasks
 from osfcore.experiments.charts import Axis, Chart, Curve, cumulative, write_charts
-from osfcore.experiments.estimation_scores import (
-    FrameScore,
-    TrackScore,
-    coverage,
-    flagged_shares,
-    flags,
-    is_right,
-    objects_of,
-    pose_errors,
-    ratios_of,
-    refused_frame,
-    score_frame,
-    share_right,
-)
-from osfcore.experiments.estimation_tasks import STEPS, BadScore, last_estimate, warm_models
+from osfcore.experiments.estimation_tasks import STEPS, Absence, BadScore, last_estimate, warm_models
 from osfcore.experiments.factors import Factor, factor_named
 from osfcore.experiments.harness import (
     MAX_TASKS,
@@ -72,6 +58,7 @@ from osfcore.io.files import write_json
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.json_codec import decode, encode
 from osfcore.io.scene_file import estimated_from_json, estimated_to_json
+from osfcore.metrics.pose_errors import adds, direction_components, rotation_components, rotation_error
 from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
@@ -148,7 +135,20 @@ def evaluate_estimate(
         WorkerDied: if a worker process ended.
         CorruptFile, CannotWrite: as files are.
     """
-    runner = TaskRunner(config, _checked_names(config, fields, assets), fields, assets)
+    limits = ("number of bad cases", config.bad, 0, MAX_TASKS), ("objects in a scene", config.objects, 1, MAX_OBJECTS)
+    check_run(config.tasks, config.seed, *limits, size=config.size)
+    for part in config.parts:
+        if part not in PARTS:
+            raise InvalidInput("part", part, f"one of {', '.join(PARTS)}")
+    for factor in config.factors:
+        factor_named(factor)  # raises UnknownName
+    names = chosen_objects(config.names, fields, assets)
+    least = config.objects + (1 if config.bad else 0)  # a bad case calls an object by another's name
+    if len(names) < least:
+        raise InvalidInput("number of names", len(names), f"{least} or more for {config.objects} objects in a scene")
+    if config.bad and config.objects < 2:
+        raise InvalidInput("objects in a scene", config.objects, "2 or more with bad cases, which swap masks")
+    runner = TaskRunner(config, names, fields, assets)
     kept: dict[str, list[TaskResult]] = {}
     jobs = _jobs(config, runner, kept)
     total, done = sum(count for _, count, _ in jobs.values()), 0
@@ -163,29 +163,6 @@ def evaluate_estimate(
     _write_galleries(config.folder, report, kept)
     write_json(config.folder / REPORT_FILE, report.to_json())
     yield EvaluationStep(total, total, "Everything is measured", report)
-
-
-def _checked_names(config: EvaluateEstimate, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    """Return the objects to draw from, after everything asked for was found possible."""
-    check_run(
-        config.tasks,
-        config.seed,
-        ("number of bad cases", config.bad, 0, MAX_TASKS),
-        ("objects in a scene", config.objects, 1, MAX_OBJECTS),
-        size=config.size,
-    )
-    for part in config.parts:
-        if part not in PARTS:
-            raise InvalidInput("part", part, f"one of {', '.join(PARTS)}")
-    for factor in config.factors:
-        factor_named(factor)  # raises UnknownName
-    names = chosen_objects(config.names, fields, assets)
-    least = config.objects + (1 if config.bad else 0)  # a bad case calls an object by another's name
-    if len(names) < least:
-        raise InvalidInput("number of names", len(names), f"{least} or more for {config.objects} objects in a scene")
-    if config.bad and config.objects < 2:
-        raise InvalidInput("objects in a scene", config.objects, "2 or more with bad cases, which swap masks")
-    return names
 
 
 def _jobs(
@@ -240,7 +217,7 @@ class TaskRunner:
 
     def fixed_light(self, number: int) -> Piece:
         """Return the first frame with the light held overhead."""
-        return self._first("fixed_light", number, replace(self._config.effort, held_light=_OVERHEAD), ALL_VIEWS)
+        return self._first("fixed_light", number, replace(self._config.effort, held_light=_OVERHEAD))
 
     def varied(self, number: int, factor: str) -> Piece:
         """Return the first frame of a task under a factor of variation."""
@@ -269,7 +246,7 @@ class TaskRunner:
         # A case may call up an object that its scene does not hold.
         return self._piece("bad", number, draw, effort, partial(self._spoiled, number, draw.seed), all=self._checksums)
 
-    def _first(self, part: str, number: int, effort: FirstFrameConfig, cameras: tuple[int, ...]) -> Piece:
+    def _first(self, part: str, number: int, effort: FirstFrameConfig, cameras: tuple[int, ...] = ALL_VIEWS) -> Piece:
         draw = self._draw(number)
         work = partial(self._seen_first, draw, effort, cameras)
         return self._piece(part, number, draw, asdict(effort), work, views=list(cameras))
@@ -277,13 +254,8 @@ class TaskRunner:
     def _piece(
         self, part: str, number: int, draw: Draw, effort: dict[str, Any], work: Callable[[], TaskResult], **more: object
     ) -> Piece:
-        given = {
-            "version": VERSION,
-            **scene_circumstances(draw, self._fields, self._library),
-            "size": self._config.size,
-            "effort": effort,
-            **more,
-        }
+        scene = scene_circumstances(draw, self._fields, self._library)
+        given = {"version": VERSION, **scene, "size": self._config.size, "effort": effort, **more}
         return Piece(f"{number:04d}", TaskCache(self._config.folder / part), given, work)
 
     # How they are measured
@@ -311,12 +283,12 @@ class TaskRunner:
             estimates.append(last_estimate(estimate_next(models, frame.observation, expected, rng, effort)))
             seconds.append(time.perf_counter() - began)
             expected = estimates[-1].state
-            errors.append(pose_errors(expected, frame.truth, assets))
+            errors.append([tuple(one.tolist()) for one in pose_errors(expected, frame.truth, assets)])
         score = TrackScore(
             names=draw.names,
             right_at_start=tuple(one.is_right for one in first.objects),
-            position_mm=tuple(tuple(position.tolist()) for position, _ in errors),
-            rotation_deg=tuple(tuple(rotation.tolist()) for _, rotation in errors),
+            position_mm=tuple(position for position, _ in errors),
+            rotation_deg=tuple(rotation for _, rotation in errors),
             absent=tuple(frame.absent for frame in pushes.frames),
             doubted=tuple(map(flags, estimates)),
             seconds=tuple(seconds),
@@ -354,21 +326,15 @@ class TaskRunner:
         except OsfError as error:
             refused = str(error)
         seconds = time.perf_counter() - began
-        score = (
-            BadScore(case.kind, refused, "", is_right=False, seconds=seconds)
-            if estimate is None
-            else self._judged(estimate, case, seconds)
-        )
+        score = BadScore(case.kind, refused, "", is_right=False, seconds=seconds)
+        if estimate is not None:  # an answer that names an object that is not there is wrong
+            there = [n for n, name in enumerate(estimate.state.names) if name in case.truth.names]
+            names = tuple(estimate.state.names[n] for n in there)
+            state = replace(estimate.state, names=names, poses=estimate.state.poses[there])
+            errors = [tuple(one.tolist()) for one in pose_errors(state, case.truth, self._meshes(names))]
+            are_right = len(names) == len(estimate.state.names) and all(map(is_right, *errors))
+            score = BadScore(case.kind, "", estimate.reason, are_right, *errors, seconds)
         return TaskResult({"score": encode(score)}, self._compared(case.observation, estimate))
-
-    def _judged(self, estimate: EstimatedState, case: tasks.BadCase, seconds: float) -> BadScore:
-        """Score the objects that are there; an answer that names one that is not there is wrong."""
-        there = [n for n, name in enumerate(estimate.state.names) if name in case.truth.names]
-        names = tuple(estimate.state.names[n] for n in there)
-        state = replace(estimate.state, names=names, poses=estimate.state.poses[there])
-        position, rotation = (errors.tolist() for errors in pose_errors(state, case.truth, self._meshes(names)))
-        are_right = len(names) == len(estimate.state.names) and all(map(is_right, position, rotation))
-        return BadScore(case.kind, "", estimate.reason, are_right, tuple(position), tuple(rotation), seconds)
 
     def _timed(self, steps: Iterator[EstimateStep], frame: tasks.Frame) -> tuple[FrameScore, EstimatedState | None]:
         """Run an estimate; a refusal is a result too."""
@@ -428,6 +394,270 @@ def _shared_runner(
     return TaskRunner(config, names, fields, assets)
 
 
+# Scores: errors of one frame and of a tracked episode, and figures of many of them.
+#
+# An object's pose is right if it is off by less than 1 cm and 5 deg, symmetries considered. Whatever an estimator
+# refused counts as wrong in every share and is left out of medians, which would have no number for it. A wrong first
+# pose stays wrong in what follows: nothing is put right by the truth.
+
+
+RIGHT_MM, RIGHT_DEG = 10.0, 5.0
+LOST_MM, LOST_DEG = 30.0, 20.0
+LOST_STEPS = 2  # running
+COVERED = 2.0  # standard deviations; of Gaussian errors .954 lie within them
+_POINTS = 2000  # of a mesh that ADD-S looks at
+_MOST_RATIO = 1e6  # of an error over a deviation of 0
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectScore:
+    """Errors of one object's estimate.
+
+    Attributes:
+        name: of the object.
+        position_mm: distance from the true position [mm].
+        rotation_deg: angle to the nearest orientation that looks like the true one [deg].
+        adds_mm: ADD-S [mm].
+        position_std_mm: claimed, per axis [mm]; None if it is boundless.
+        position_ratios: |error| over the claimed deviation, for each axis.
+        rotation_ratios: the same of the rotation vector; two numbers for a body of revolution.
+        flagged: the estimator doubts this object; or it doubts the whole without naming an object.
+        doubt: why, in its words.
+        absent: why no image shows the object; "" where one does.
+    """
+
+    name: str
+    position_mm: float
+    rotation_deg: float
+    adds_mm: float
+    position_std_mm: float | None
+    position_ratios: tuple[float, ...]
+    rotation_ratios: tuple[float, ...]
+    flagged: bool
+    doubt: str
+    absent: Absence = ""
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the pose is off by less than 1 cm and 5 deg."""
+        return is_right(self.position_mm, self.rotation_deg)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameScore:
+    """Errors of the estimate of one frame or goal.
+
+    Attributes:
+        names: the objects in it.
+        objects: their scores; none if the frame was refused.
+        light_deg: angle between estimated and true light [deg]; None if refused.
+        light_ratios: |error| over the claimed deviation, across the true direction; none if the light was given.
+        seconds: that the estimate took.
+        trusted: by the estimator, as a whole.
+        refused: why there is no estimate; "" if there is one.
+    """
+
+    names: tuple[str, ...]
+    objects: tuple[ObjectScore, ...]
+    light_deg: float | None
+    light_ratios: tuple[float, ...]
+    seconds: float
+    trusted: bool
+    refused: str = ""
+
+    @property
+    def is_right(self) -> bool:
+        """Whether all objects are right."""
+        return not self.refused and all(score.is_right for score in self.objects)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackScore:
+    """Errors of an episode; each list has one row for each step and in it one entry for each object.
+
+    Attributes:
+        names: the objects.
+        right_at_start: whether their first poses were right.
+        position_mm: distances from the true positions [mm].
+        rotation_deg: angles, symmetries considered [deg].
+        absent: why no image shows an object; "" where one does.
+        doubted: whether the estimator doubts an object.
+        seconds: that each step's estimate took.
+        moved_m: how far each object came from its first place [m].
+        refused: why there is no track; "" if there is one.
+    """
+
+    names: tuple[str, ...]
+    right_at_start: tuple[bool, ...]
+    position_mm: tuple[tuple[float, ...], ...]
+    rotation_deg: tuple[tuple[float, ...], ...]
+    absent: tuple[tuple[Absence, ...], ...]
+    doubted: tuple[tuple[bool, ...], ...]
+    seconds: tuple[float, ...]
+    moved_m: tuple[float, ...]
+    refused: str = ""
+
+    @property
+    def lost_at(self) -> tuple[int | None, ...]:
+        """The step at which the track of each object counts as lost, from 0; None where it is kept."""
+        if self.refused:
+            return (0,) * len(self.names)
+        by_object = (zip(*table, strict=True) for table in (self.position_mm, self.rotation_deg, self.absent))
+        return tuple(map(lost_at, *by_object))
+
+
+def is_right(position_mm: float, rotation_deg: float) -> bool:
+    """Return whether a pose is off by less than 1 cm and 5 deg."""
+    return position_mm < RIGHT_MM and rotation_deg < RIGHT_DEG
+
+
+def lost_at(position_mm: Sequence[float], rotation_deg: Sequence[float], absent: Sequence[Absence]) -> int | None:
+    """Return the first step at which an object was over 3 cm or 20 deg off for two steps running; None if never.
+
+    Args:
+        position_mm: errors, step by step [mm].
+        rotation_deg: likewise, symmetries considered [deg].
+        absent: why no image shows the object; "" where one does. A step without an image interrupts the run.
+
+    Returns:
+        The second of the two steps, from 0.
+    """
+    run = 0
+    for step, (position, rotation, why) in enumerate(zip(position_mm, rotation_deg, absent, strict=True)):
+        run = run + 1 if not why and (position > LOST_MM or rotation > LOST_DEG) else 0
+        if run == LOST_STEPS:
+            return step
+    return None
+
+
+def pose_errors(
+    estimate: SceneState, truth: SceneState, assets: Mapping[str, ObjectAsset]
+) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    """Return the errors of position [mm] and rotation [deg], objects in the order of the estimate.
+
+    Args:
+        estimate: poses of objects.
+        truth: of the same objects, in any order.
+        assets: by name; their symmetries say which rotations look alike.
+    """
+    pairs = [(estimate.pose(name), truth.pose(name), assets[name].info.symmetry) for name in estimate.names]
+    shift = [1000 * np.linalg.norm(mine.position - true.position) for mine, true, _ in pairs]
+    turn = [np.rad2deg(rotation_error(alike, mine.quaternion, true.quaternion)) for mine, true, alike in pairs]
+    return np.array(shift), np.array(turn)
+
+
+def score_frame(
+    estimate: EstimatedState,
+    truth: SceneState,
+    assets: Mapping[str, ObjectAsset],
+    seconds: float,
+    absent: Sequence[Absence] | None = None,
+) -> FrameScore:
+    """Score one estimate.
+
+    Args:
+        estimate: of the objects of the truth, in any order.
+        truth: poses and light.
+        assets: by name.
+        seconds: that it took.
+        absent: for each object of the truth.
+    """
+    state = estimate.state
+    apart = direction_components(state.light.direction, truth.light.direction)
+    unseen = dict(zip(truth.names, absent or ("",) * len(truth.names), strict=True))
+    objects = tuple(_object(estimate, n, truth, assets[name], unseen[name]) for n, name in enumerate(state.names))
+    ratios = _ratios(apart, estimate.light_std) if estimate.light_std > 0 else ()
+    light_deg = float(np.rad2deg(np.linalg.norm(apart)))
+    return FrameScore(state.names, objects, light_deg, ratios, seconds, estimate.trusted)
+
+
+def refused_frame(names: tuple[str, ...], reason: str, seconds: float) -> FrameScore:
+    """Score a frame that the estimator refused.
+
+    Args:
+        names: the objects in it.
+        reason: why it was refused; not empty.
+        seconds: until it was refused [s].
+    """
+    return FrameScore(names, (), None, (), seconds, False, reason)
+
+
+def flags(estimate: EstimatedState) -> tuple[bool, ...]:
+    """Return which objects the estimator warns of; a warning that names none is one of them all."""
+    doubted = tuple(bool(doubt) for doubt in estimate.doubts)
+    return doubted if any(doubted) else (not estimate.trusted,) * len(doubted)
+
+
+def _object(estimate: EstimatedState, n: int, truth: SceneState, asset: ObjectAsset, absent: Absence) -> ObjectScore:
+    name = estimate.state.names[n]
+    mine, true = estimate.state.pose(name), truth.pose(name)
+    shift = mine.position - true.position
+    turn = rotation_components(asset.info.symmetry, mine.quaternion, true.quaternion)
+    vertices = asset.mesh.vertices
+    points = vertices[:: max(1, len(vertices) // _POINTS)].astype(float)
+    deviation = float(estimate.position_std[n])
+    return ObjectScore(
+        name=name,
+        position_mm=1000 * float(np.linalg.norm(shift)),
+        rotation_deg=float(np.rad2deg(np.linalg.norm(turn))),
+        adds_mm=1000 * adds(points, mine, true),
+        position_std_mm=1000 * deviation if np.isfinite(deviation) else None,
+        position_ratios=_ratios(shift, deviation),
+        rotation_ratios=_ratios(turn, float(estimate.rotation_std[n])),
+        flagged=flags(estimate)[n],
+        doubt=estimate.doubts[n],
+        absent=absent,
+    )
+
+
+def _ratios(errors: np.ndarray, deviation: float) -> tuple[float, ...]:
+    """Return |error| / deviation; 0 for a boundless deviation."""
+    return tuple(np.minimum(np.abs(errors) / max(deviation, 1e-300), _MOST_RATIO).tolist())
+
+
+# Figures of many scores
+
+
+def objects_of(frames: Iterable[FrameScore]) -> list[ObjectScore]:
+    """Return the scores of all objects that were estimated."""
+    return [score for frame in frames for score in frame.objects]
+
+
+def share_right(frames: Sequence[FrameScore]) -> float | None:
+    """Return the share of all objects, also those of refused frames, that are right; None without objects."""
+    total = sum(len(frame.names) for frame in frames)
+    return sum(score.is_right for score in objects_of(frames)) / total if total else None
+
+
+class Ratios(NamedTuple):
+    """|error| over claimed deviation of right estimates, axis by axis.
+
+    Attributes:
+        position: of right objects.
+        rotation: of right objects.
+        light: of frames in which every object is right.
+    """
+
+    position: tuple[float, ...]
+    rotation: tuple[float, ...]
+    light: tuple[float, ...]
+
+
+def ratios_of(frames: Sequence[FrameScore]) -> Ratios:
+    """Collect the ratios of right estimates: a deviation describes errors around the truth, not gross mistakes."""
+    right = [score for score in objects_of(frames) if score.is_right]
+    return Ratios(
+        tuple(ratio for score in right for ratio in score.position_ratios),
+        tuple(ratio for score in right for ratio in score.rotation_ratios),
+        tuple(ratio for frame in frames if frame.is_right for ratio in frame.light_ratios),
+    )
+
+
+def coverage(ratios: Iterable[float]) -> float | None:
+    """Return the share within two standard deviations; None without ratios."""
+    return mean(ratio <= COVERED for ratio in ratios)
+
+
 # The report.
 
 
@@ -473,15 +703,20 @@ class EstimateReport:
 
         `flagged_good` and `flagged_bad` are over first frames and goals together.
         """
-        flagged_good, flagged_bad = flagged_shares([*self.first, *self.all_goals])
+        ratios, objects = ratios_of(self.first), objects_of([*self.first, *self.all_goals])
         report = {
             "tasks": len(self.first),
             **_frames(self.first, "first"),
             "by_object": _by_object(self.first),
-            **_uncertainty(self.first),
+            # How honest claimed deviations are, and how large; of right estimates alone.
+            "two_sigma_coverage": coverage(ratios.position + ratios.rotation + ratios.light),
+            "two_sigma_coverage_position": coverage(ratios.position),
+            "two_sigma_coverage_rotation": coverage(ratios.rotation),
+            "two_sigma_coverage_light": coverage(ratios.light),
+            "mean_position_std_mm": mean(o.position_std_mm for o in objects_of(self.first) if o.is_right),
             **_goals(self),
-            "flagged_good": flagged_good,
-            "flagged_bad": flagged_bad,
+            "flagged_good": mean(o.flagged for o in objects if o.is_right),
+            "flagged_bad": mean(o.flagged for o in objects if not o.is_right),
             **_tracks(self.tracks),
             "frac_1cm_5deg_fixed_light": None if self.fixed_light is None else share_right(self.fixed_light),
             "fixed_light": None if self.fixed_light is None else _brief(self.fixed_light),
@@ -504,7 +739,11 @@ def _report(kept: Mapping[str, Sequence[TaskResult]]) -> EstimateReport:
     return EstimateReport(
         first=scores(FrameScore, "first"),
         tracks=scores(TrackScore, "track") if "track" in kept else None,
-        goals=tuple(map(goals, kept["goal"])) if "goal" in kept else None,
+        goals=tuple(
+            tuple(decode(FrameScore, score, "score") for score in task.figures["scores"]) for task in kept["goal"]
+        )
+        if "goal" in kept
+        else None,
         fixed_light=scores(FrameScore, "fixed_light") if "fixed_light" in kept else None,
         views={n: scores(FrameScore, f"views_{n}") for n in VIEWS} if "fixed_light" in kept else None,
         bad=scores(BadScore, "bad") if "bad" in kept else None,
@@ -540,18 +779,6 @@ def _by_object(frames: Sequence[FrameScore]) -> dict[str, dict[str, Any]]:
             **spread("rotation_deg", [o.rotation_deg for o in own], _OF),
         }
     return rows
-
-
-def _uncertainty(frames: Sequence[FrameScore]) -> dict[str, Any]:
-    """Return how honest claimed deviations are, and how large; of right estimates alone."""
-    ratios = ratios_of(frames)
-    return {
-        "two_sigma_coverage": coverage(ratios.pooled),
-        "two_sigma_coverage_position": coverage(ratios.position),
-        "two_sigma_coverage_rotation": coverage(ratios.rotation),
-        "two_sigma_coverage_light": coverage(ratios.light),
-        "mean_position_std_mm": mean(o.position_std_mm for o in objects_of(frames) if o.is_right),
-    }
 
 
 def _goals(report: EstimateReport) -> dict[str, Any]:
@@ -829,27 +1056,25 @@ def bad_failure(title: str, score: BadScore, shown: Sequence[Comparison]) -> Fai
 def write_gallery(path: Path, failures: Iterable[Failure | None]) -> None:
     """Draw the worst failures below each other; without any, remove an older picture.
 
+    Each is what went wrong in words, and below it observed images, rendered ones and their difference.
+
     Raises:
         CannotWrite: if the disk refuses.
     """
     chosen = sorted((f for f in failures if f is not None and f.shown), key=lambda f: -f.badness)[:MOST_SHOWN]
-    if chosen:
-        write_png(path, _gallery(chosen))
-    else:
+    if not chosen:
         path.unlink(missing_ok=True)
-
-
-def _gallery(failures: Sequence[Failure]) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw for each what went wrong in words, and below it observed images, rendered ones and their difference."""
+        return
     blocks = []
-    for failure in failures:
+    for failure in chosen:
         sheet = contact_sheet(failure.shown, per_row=_PER_ROW, truth="seen")
         words = np.full((_LINE_PX * len(failure.lines) + 4, max(sheet.shape[1], _LEAST_WIDTH_PX), 3), 255, np.uint8)
         for number, line in enumerate(failure.lines):
             put_text(words, line, (4, _LINE_PX * (number + 1) - 4), words.shape[1] - 8)
         blocks += [words, sheet]
     width = max(block.shape[1] for block in blocks)
-    return np.vstack([np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=255) for b in blocks])
+    padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=255) for b in blocks]
+    write_png(path, np.vstack(padded))
 
 
 def _write_galleries(folder: Path, report: EstimateReport, kept: Mapping[str, Sequence[TaskResult]]) -> None:

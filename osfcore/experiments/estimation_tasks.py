@@ -7,7 +7,7 @@ scores alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -316,7 +316,8 @@ def summary(scores: Sequence[BadScore]) -> dict[str, Any]:
     all of them.
     """
 
-    def counts(chosen: Sequence[BadScore]) -> dict[str, int]:
+    def counts(kinds: Collection[str]) -> dict[str, int]:
+        chosen = [s for s in scores if s.kind in kinds]
         return {
             "cases": len(chosen),
             "refused": sum(bool(s.refused) for s in chosen),
@@ -325,9 +326,9 @@ def summary(scores: Sequence[BadScore]) -> dict[str, Any]:
             "confident_wrong": sum(s.is_confidently_wrong for s in chosen),
         }
 
-    by_kind = {kind: [s for s in scores if s.kind == kind] for kind in KINDS}
-    total = {f"bad_{key}": value for key, value in counts(scores).items()}
-    return {**total, "bad_by_kind": {kind: counts(chosen) for kind, chosen in by_kind.items() if chosen}}
+    present = {s.kind for s in scores}
+    total = {f"bad_{key}": value for key, value in counts(present).items()}
+    return {**total, "bad_by_kind": {kind: counts({kind}) for kind in KINDS if kind in present}}
 
 
 def _swapped_masks(scene: _Scene) -> BadCase:
@@ -363,8 +364,7 @@ def _wrong_name(scene: _Scene) -> BadCase:
 
 def _black(scene: _Scene) -> BadCase:
     frame = scene.frame()
-    images = np.zeros_like(frame.observation.images)
-    return BadCase("black images", replace(frame.observation, images=images), frame.truth)
+    return BadCase("black images", replace(frame.observation, images=0 * frame.observation.images), frame.truth)
 
 
 def _saturated(scene: _Scene) -> BadCase:

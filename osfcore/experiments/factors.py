@@ -9,7 +9,6 @@ each of them small.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal
@@ -21,7 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 from osfcore.control.goal import GoalImage
 from osfcore.errors import UnknownName
 from osfcore.estimation.camera_response import linear_of_srgb, srgb_of_linear
-from osfcore.geometry.cameras import Camera, default_cameras
+from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import Observation, SceneState
@@ -188,24 +187,19 @@ class Factor:
         return replace(task, start=replace(task.start, light=start), goal=replace(task.goal, light=goal))
 
 
-def _lamp(
-    *, ambient: float | None = None, intensity: float = 1.0, colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
-) -> Factor:
-    """Return a factor of the lamp; a share of ambient light takes from the diffuse light."""
-    lamp = Lamp(intensity=intensity, colour=colour)
-    if ambient is not None:
-        lamp = replace(lamp, ambient=ambient, diffuse=1 - ambient)
-    return Factor(Conditions(lamp=lamp))
+def _ambient(share: float) -> Factor:
+    """Return a lamp whose ambient light takes from the diffuse light."""
+    return Factor(Conditions(lamp=Lamp(ambient=share, diffuse=1 - share)))
 
 
 FACTORS: Mapping[str, Factor] = MappingProxyType(
     {
         "light_low": Factor(light_elevation_deg=(5.0, 10.0)),
-        "intensity_0.5": _lamp(intensity=0.5),
-        "intensity_1.5": _lamp(intensity=1.5),
-        "ambient_0.1": _lamp(ambient=0.1),
-        "ambient_0.5": _lamp(ambient=0.5),
-        "light_coloured": _lamp(colour=(1.0, 0.85, 0.65)),
+        "intensity_0.5": Factor(Conditions(lamp=Lamp(intensity=0.5))),
+        "intensity_1.5": Factor(Conditions(lamp=Lamp(intensity=1.5))),
+        "ambient_0.1": _ambient(0.1),
+        "ambient_0.5": _ambient(0.5),
+        "light_coloured": Factor(Conditions(lamp=Lamp(colour=(1.0, 0.85, 0.65)))),
         "table_colour": Factor(Conditions(table=TableSurface((0.36, 0.44, 0.54)))),
         "table_wood": Factor(has_wooden_table=True),
         "camera_shifted": Factor(camera_turn_rad=float(np.deg2rad(0.3)), camera_shift_m=0.003),
@@ -222,7 +216,7 @@ FACTORS: Mapping[str, Factor] = MappingProxyType(
         "objects_unseen": Factor(has_unseen_objects=True),
         "exposure_0.7": Factor(exposure=0.7),
         "exposure_1.4": Factor(exposure=1.4),
-        "ambient_0.6": _lamp(ambient=0.6),
+        "ambient_0.6": _ambient(0.6),
         "table_dark": Factor(Conditions(table=TableSurface((0.20, 0.19, 0.17)))),
         "mild_together": Factor(
             Conditions(lamp=Lamp(ambient=0.35, diffuse=0.65), table=TableSurface((0.50, 0.52, 0.53))),
@@ -253,10 +247,11 @@ def factor_named(name: str) -> Factor:
     return FACTORS[name]
 
 
-class VariedWorld:
+class VariedWorld(Tabletop):
     """A simulated tabletop under a factor: a `World` for the method, with the truth for whoever scores it.
 
     What a factor leaves to chance but for noise (wood, errors of the cameras) is drawn once, when the world is made.
+    Only `observe` and `goal_image` show what the method gets; `render` has ideal cameras, for scores and pictures.
 
     Args:
         library: where the objects' meshes are.
@@ -264,7 +259,6 @@ class VariedWorld:
         rng: draws what the factor leaves to chance.
         cameras: what `observe` looks through, as they are calibrated.
         request: what `reset` puts on the table.
-        executor: takes the views of an observation side by side, if given; threads serve.
 
     Raises:
         UnknownName, MissingAssets, InvalidInput: if the request cannot be met.
@@ -276,19 +270,14 @@ class VariedWorld:
         factor: Factor,
         rng: np.random.Generator,
         *,
-        cameras: tuple[Camera, ...] | None = None,
+        cameras: tuple[Camera, ...],
         request: SceneRequest | None = None,
-        executor: Executor | None = None,
     ) -> None:
-        self.cameras = default_cameras() if cameras is None else cameras
         self._factor, self._rng = factor, rng
-        errors = factor.camera_errors(rng, len(self.cameras))
+        errors = factor.camera_errors(rng, len(cameras))
         (self._goal_error,) = factor.camera_errors(rng, 1)
-        conditions = factor.drawn_conditions(rng)
-        standing = tuple(error.applied(camera) for error, camera in zip(errors, self.cameras, strict=True))
-        self._world = Tabletop(library, cameras=standing, request=request, executor=executor, conditions=conditions)
-
-    # The World protocol
+        super().__init__(library, cameras=cameras, request=request, conditions=factor.drawn_conditions(rng))
+        self._standing = tuple(error.applied(camera) for error, camera in zip(errors, cameras, strict=True))
 
     def reset(self, seed: int) -> Observation:
         """Put a new random scene on the table, at rest.
@@ -296,27 +285,13 @@ class VariedWorld:
         Raises:
             NoRoom: if the objects do not fit side by side.
         """
-        self._world.arrange(seed)
-        self._world.set_light(self._factor.light(self._world.truth().light, self._rng))
+        self.arrange(seed)
+        self.set_light(self._factor.light(self.truth().light, self._rng))
         return self.observe()
 
     def observe(self, *, masks: bool = False) -> Observation:
         """Return one image per camera, as the method gets them, with the cameras as they are calibrated."""
-        return self._factor.received(self._world.observe(masks=masks), self.cameras, self._rng)
-
-    def act(self, action: Float[np.ndarray, "3"]) -> None:
-        """Hold the pusher velocity (vx, vy, 0) [m/s] for 0.2 s.
-
-        Raises:
-            InvalidInput: if the action is outside its limits; the world is unchanged.
-        """
-        self._world.act(action)
-
-    def close(self) -> None:
-        """Free the simulation."""
-        self._world.close()
-
-    # What only a simulator can do
+        return self._factor.received(self.render(self._standing, masks=masks), self.cameras, self._rng)
 
     def goal_image(self, state: SceneState, camera: Camera) -> GoalImage:
         """Return a state as a camera shows it to the method, without the pusher; the table is left like that.
@@ -326,22 +301,5 @@ class VariedWorld:
             camera: as it is calibrated; all goals are taken with the same error.
         """
         self.restore(state)
-        standing = self._goal_error.applied(camera)
-        taken = self._world.render((standing,), with_pusher=False)
+        taken = self.render((self._goal_error.applied(camera),), with_pusher=False)
         return GoalImage(camera, self._factor.received(taken, (camera,), self._rng).images[0])
-
-    def restore(self, state: SceneState) -> None:
-        """Put back a state, its light as well.
-
-        Raises:
-            UnknownName, MissingAssets: if an object is not in the library.
-        """
-        self._world.restore(state)
-
-    def truth(self) -> SceneState:
-        """Return the true state, for scores; the method must not see it."""
-        return self._world.truth()
-
-    def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
-        """Return images of the present state under the factor's lamp, but by ideal cameras, for scores and pictures."""
-        return self._world.render(cameras, masks=masks, with_pusher=with_pusher)

@@ -8,7 +8,8 @@ killed, resumed and run in pieces.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -163,23 +164,20 @@ def simulate_relit(
         UnknownName, MissingAssets: if an object has no mesh here.
         NoRoom: if the objects do not fit side by side.
     """
-    world = Tabletop(library, cameras=cameras, request=SceneRequest(names=draw.names, light=draw.light))
-    try:
+    nothing, truths = Pose(np.zeros((0, 3)), np.zeros((0, 4))), []
+    request = SceneRequest(names=draw.names, light=draw.light)
+    with closing(Tabletop(library, cameras=cameras, request=request)) as world:
         world.arrange(draw.seed)
-        return tuple(_truth(world, light, cameras) for light in lights)
-    finally:
-        world.close()
-
-
-def _truth(world: Tabletop, light: Light, cameras: tuple[Camera, ...]) -> Truth:
-    world.set_light(light)
-    pictures = world.pictures(cameras, with_pusher=False)
-    nothing = Pose(np.zeros((0, 3)), np.zeros((0, 4)))
-    empty = RayTracer({}).render(SceneState((), nothing, light, None), cameras)
-    objects = np.stack([picture.coverage.sum(axis=0) > 0 for picture in pictures])
-    darker = [np.any(lit.rgb - picture.rgb > _SHADE, axis=-1) for lit, picture in zip(empty, pictures, strict=True)]
-    images = np.stack([picture.rgb for picture in pictures])
-    return Truth(replace(world.truth(), pusher=None), cameras, images, objects, np.stack(darker) & ~objects)
+        for light in lights:
+            world.set_light(light)
+            pictures = world.pictures(cameras, with_pusher=False)
+            empty = RayTracer({}).render(SceneState((), nothing, light, None), cameras)
+            objects = np.stack([picture.coverage.sum(axis=0) > 0 for picture in pictures])
+            pairs = zip(empty, pictures, strict=True)
+            darker = np.stack([np.any(lit.rgb - picture.rgb > _SHADE, axis=-1) for lit, picture in pairs])
+            images = np.stack([picture.rgb for picture in pictures])
+            truths.append(Truth(replace(world.truth(), pusher=None), cameras, images, objects, darker & ~objects))
+    return tuple(truths)
 
 
 def render_scene(renderer: Renderer, truth: Truth) -> Float[np.ndarray, "V h w 3"]:
@@ -310,7 +308,13 @@ def evaluate_fields(config: EvaluateFields, fields: FieldLibrary, assets: AssetL
         InvalidInput: if a number is out of range.
         CorruptFile, CannotWrite: as files are.
     """
-    names = _checked_names(config, fields, assets)
+    limits = ("number of scenes", config.tasks, 0, MAX_TASKS), ("objects in a scene", config.objects, 1, MAX_OBJECTS)
+    check_ranges(*limits)
+    check_seed(config.seed)
+    image_side(config.size)
+    if config.names == ():
+        raise InvalidInput("number of names", 0, "1 or more, or --names left out for all")
+    names = chosen_objects(config.names, fields, assets)
     tasks = config.tasks if len(names) >= config.objects else 0  # too few objects make no scene
     total = len(names) + tasks
     objects: dict[str, TaskResult] = {}
@@ -320,11 +324,25 @@ def evaluate_fields(config: EvaluateFields, fields: FieldLibrary, assets: AssetL
     write_png(config.out / "objects.png", contact_sheet(shown))
     figures = {name: field_figures(result, fields.info(name).path) for name, result in objects.items()}
     scenes: list[TaskResult] = []
-    load = cache(fields.load)
+    load, results = cache(fields.load), TaskCache(config.out / "scenes")
     for number in range(tasks):
         yield EvaluationStep(len(names) + number, total, f"Scenes ({number + 1} of {tasks})")
         draw = draw_scene(names, config.objects, config.seed, number)
-        scenes.append(_scene(config, number, draw, fields, load, assets))
+        circumstances = {
+            "format": FORMAT,
+            **scene_circumstances(draw, fields, assets),
+            "size": config.size,
+            "quality": asdict(SCENE_QUALITY),
+        }
+        result = results.read(f"{number:04d}", circumstances)
+        if result is None:
+            truth = simulate(draw, assets, default_cameras(config.size))
+            renderer = SceneRenderer({one: load(one) for one in draw.names}, fields.load_table())
+            views = compare_scene(truth, render_scene(renderer, truth))
+            result = TaskResult(figures_of(views), tuple(view.comparison for view in views))
+            write_png(results.folder / f"{number:04d}.png", contact_sheet(result.shown))
+            results.write(f"{number:04d}", circumstances, result)
+        scenes.append(result)
     if scenes:  # one view of each: the next camera every time
         shown = [replace(scene.shown[i % len(scene.shown)], label=f"scene {i}") for i, scene in enumerate(scenes)]
         write_png(config.out / "scenes.png", contact_sheet(shown))
@@ -343,18 +361,6 @@ def evaluate_set(config: EvaluateSet) -> Iterator[EvaluationStep]:
     write_png(config.out / "objects.png", contact_sheet(result.shown))
     report = fields_report({name: field_figures(result, config.weights)}, ())
     yield EvaluationStep(1, 1, "Everything is measured", report)
-
-
-def _checked_names(config: EvaluateFields, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    """Return the objects to measure, after everything asked for was found possible."""
-    check_ranges(
-        ("number of scenes", config.tasks, 0, MAX_TASKS), ("objects in a scene", config.objects, 1, MAX_OBJECTS)
-    )  # fmt: skip
-    check_seed(config.seed)
-    image_side(config.size)
-    if config.names == ():
-        raise InvalidInput("number of names", 0, "1 or more, or --names left out for all")
-    return chosen_objects(config.names, fields, assets)
 
 
 def _object_alone(
@@ -396,30 +402,3 @@ def _measured(name: str, weights: Path, data: Path, at: tuple[int, int]) -> _Ste
     figures = {key: float(np.mean([getattr(v, key) for v in views])) for key in ("psnr_full", "psnr_mask", "ssim")}
     chosen = np.unique(np.linspace(0, count - 1, _SHOWN).astype(int)).tolist()
     return TaskResult({**figures, "images": count}, tuple(views[i].comparison for i in chosen))
-
-
-def _scene(
-    config: EvaluateFields,
-    number: int,
-    draw: Draw,
-    fields: FieldLibrary,
-    load: Callable[[str], KiloOSF],
-    assets: AssetLibrary,
-) -> TaskResult:
-    """Return figures and images of one scene, measured or taken over; `load` loads the field of an object."""
-    results, name = TaskCache(config.out / "scenes"), f"{number:04d}"
-    circumstances = {
-        "format": FORMAT,
-        **scene_circumstances(draw, fields, assets),
-        "size": config.size,
-        "quality": asdict(SCENE_QUALITY),
-    }
-    if (kept := results.read(name, circumstances)) is not None:
-        return kept
-    truth = simulate(draw, assets, default_cameras(config.size))
-    renderer = SceneRenderer({one: load(one) for one in draw.names}, fields.load_table())
-    views = compare_scene(truth, render_scene(renderer, truth))
-    result = TaskResult(figures_of(views), tuple(view.comparison for view in views))
-    write_png(config.out / "scenes" / f"{name}.png", contact_sheet(result.shown))
-    results.write(name, circumstances, result)
-    return result

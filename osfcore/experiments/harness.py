@@ -231,10 +231,6 @@ class Piece:
     circumstances: Mapping[str, Any]
     work: Callable[[], TaskResult]
 
-    def kept(self) -> TaskResult | None:
-        """Return the result of an earlier run, if there is one."""
-        return self.cache.read(self.name, self.circumstances)
-
 
 def results_of(pieces: Sequence[Piece], executor: Executor | None = None) -> Iterator[list[TaskResult | None]]:
     """Do what is not done yet, and yield all results so far, in the order of the pieces, after each that was done.
@@ -248,7 +244,7 @@ def results_of(pieces: Sequence[Piece], executor: Executor | None = None) -> Ite
         WorkerDied: if a worker process ended; what was done until then is kept.
         CannotWrite: if the disk refuses.
     """
-    results = [piece.kept() for piece in pieces]
+    results = [piece.cache.read(piece.name, piece.circumstances) for piece in pieces]
     yield list(results)
     missing = [n for n, result in enumerate(results) if result is None]
     for n, result in _alone(pieces, missing) if executor is None else _shared_out(pieces, missing, executor):

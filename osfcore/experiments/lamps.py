@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.photo.lamp import photo_lamp
 from osfcore.photo.photograph import Photograph
-from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, estimate_photo
+from osfcore.photo.poses import FINE_ACROSS, PhotoModels, estimate_photo
 from osfcore.random_streams import Stream, stream_rng, stream_seed
 from osfcore.world.imaging import Lamp, TableSurface, wooden_texture
 from osfcore.world.scenes import Conditions, SceneRequest
@@ -90,12 +91,9 @@ def lamp_scene(
     cameras = default_cameras(_SIDE)
     first = int(rng.integers(len(cameras)))
     chosen = tuple(cameras[(first + k) % len(cameras)] for k in range(views))
-    world = Tabletop(library, cameras=chosen, request=request, conditions=conditions)
-    try:
+    with closing(Tabletop(library, cameras=chosen, request=request, conditions=conditions)) as world:
         world.arrange(stream_seed(seed, Stream.LAMP_SCENE, number, int(is_near)))
         observed, truth = world.render(chosen, masks=True, with_pusher=False), world.truth()
-    finally:
-        world.close()
     photos = tuple(_taken(observed, k, rng) for k in range(views))
     poses = {name: truth.pose(name) for name in truth.names if any(name in photo.masks for photo in photos)}
     return LampScene(photos, poses, spot if is_near else None, light.direction)
@@ -251,6 +249,12 @@ def _score(
     start = time.perf_counter()
     found = photo_lamp(scene.photos, last.found, surfels)
     seconds = time.perf_counter() - start
+    right = 0
+    for one in last.found:
+        true, pose = scene.poses[one.name], one.best.pose
+        turn_rad = rotation_error(CATALOGUE[one.name].symmetry, pose.quaternion, true.quaternion)
+        is_close = np.linalg.norm(pose.position - true.position) <= _CLOSE_M
+        right += bool(is_close and np.rad2deg(turn_rad) <= _CLOSE_DEG)
     return LampScore(
         number=number,
         is_near=scene.spot is not None,
@@ -261,12 +265,6 @@ def _score(
         distance_m=found.distance if found.distance_known else None,
         is_diffuse=found.is_diffuse,
         poses=len(last.found),
-        right_poses=sum(_is_right(one, scene.poses[one.name]) for one in last.found),
+        right_poses=right,
         seconds=seconds,
     )
-
-
-def _is_right(found: PhotoObject, truth: Pose) -> bool:
-    pose = found.best.pose
-    turn_rad = float(rotation_error(CATALOGUE[found.name].symmetry, pose.quaternion, truth.quaternion))
-    return bool(np.linalg.norm(pose.position - truth.position) <= _CLOSE_M and np.rad2deg(turn_rad) <= _CLOSE_DEG)

@@ -117,16 +117,6 @@ class LampSubject:
     directions: Float[np.ndarray, "K 3"]
 
 
-def scene_folders(data: Path) -> tuple[Path, ...]:
-    """Return the folders of photographed scenes in a folder, or the folder itself, in order of name."""
-    return tuple(sorted(path.parent for path in (*data.glob(PHOTO_FILE), *data.glob(f"*/{PHOTO_FILE}"))))
-
-
-def lamp_folders(data: Path) -> tuple[Path, ...]:
-    """Return the folders with a chrome ball under several lamps, in order of name."""
-    return tuple(sorted(path.parents[1] for path in data.glob(f"**/{_MIRROR}/{_MIRROR}.mask.png")))
-
-
 def read_scene(folder: Path) -> PhotoFolder:
     """Read a photographed scene.
 
@@ -354,24 +344,6 @@ def box_and_click(mask: Bool[np.ndarray, "h w"]) -> tuple[Box, Float[np.ndarray,
     return (float(box[0]), float(box[1]), float(box[2]), float(box[3])), np.array([[column + 0.5, row + 0.5]])
 
 
-def masks_from_boxes(scene: PhotoFolder) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Return what GrabCut makes of a box and a click for each mask of a scene.
-
-    Raises:
-        InvalidInput: if nothing is found in a box.
-    """
-    encoded = scene.encoded if scene.encoded.dtype == np.uint8 else (scene.encoded // 257).astype(np.uint8)
-    marks = {name: box_and_click(mask) for name, mask in scene.photo.masks.items()}
-    boxes, clicks = {name: box for name, (box, _) in marks.items()}, {name: on for name, (_, on) in marks.items()}
-    return propose_masks(np.ascontiguousarray(encoded), boxes, clicks)
-
-
-def mask_iou(used: Photograph, given: Photograph, name: str) -> float:
-    """Return the intersection over union of the mask that was searched with and the given one."""
-    mine, its = used.masks[name], given.masks[name]
-    return float((mine & its).sum() / (mine | its).sum())
-
-
 # The evaluation.
 
 
@@ -426,7 +398,9 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ev
         ("error of masks [px]", config.mask_error_px, 0, _MOST_MASK_PX),
         ("starts of each object", config.repeats, 1, _MOST_REPEATS),
     )
-    scenes, lamps = [read_scene(path) for path in scene_folders(config.data)], lamp_folders(config.data)
+    described = sorted([*config.data.glob(PHOTO_FILE), *config.data.glob(f"*/{PHOTO_FILE}")])
+    scenes = [read_scene(path.parent) for path in described]
+    lamps = sorted(path.parents[1] for path in config.data.glob(f"**/{_MIRROR}/{_MIRROR}.mask.png"))
     known = set(fields.names())
     asked = [(scene, _names(config, scene, known)) for scene in scenes]
     cases = [(scene, names, number) for scene, names in asked if names for number in range(config.repeats)]
@@ -439,7 +413,16 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ev
     scores: list[PhotoScore] = []
     for done, (scene, names, number) in enumerate(cases):
         yield EvaluationStep(done, len(cases), f"{len(names)} objects in {scene.name}")
-        scores += _measure(config, models, renderer, scene, names, number)
+        rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, zlib.crc32(scene.name.encode()), number)
+        photo = _photo(config, scene)
+        starts = {name: _start(config, scene, name, rng) for name in names}
+        placed = {name: photo.T_world_camera @ start for name, start in starts.items() if start is not None}
+        *_, last = estimate_photo(models, [photo], names, rng, PhotoConfig(placed, config.loss))
+        for found in last.found:
+            moved = replace(found, best=replace(found.best, pose=photo.T_world_camera.inverse() @ found.best.pose))
+            write_sheet(config.folder / f"{scene.name}-{found.name}-{number}.png", models, scene.photo, moved)
+            used, given = photo.masks[found.name], scene.photo.masks[found.name]
+            scores.append(_score(renderer, scene, moved, float((used & given).sum() / (used | given).sum())))
     lamp_errors = {subject.name: lamp_errors_deg(subject) for path in lamps for subject in read_lamps(path)}
     report = photo_report(scores, lamp_errors, without)
     write_json(config.folder / "report.json", report)
@@ -450,28 +433,6 @@ def _names(config: EvaluatePhotos, scene: PhotoFolder, known: set[str]) -> list[
     """Return the objects of a scene that are looked for."""
     source = GROUND_TRUTH if config.start == PERTURBED else config.start
     return [n for n in scene.photo.masks if n in known and (config.start == NONE or n in scene.poses.get(source, {}))]
-
-
-def _measure(
-    config: EvaluatePhotos,
-    models: PhotoModels,
-    renderer: SceneRenderer,
-    scene: PhotoFolder,
-    names: list[str],
-    number: int,
-) -> list[PhotoScore]:
-    """Look for the objects of one scene, all together."""
-    rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, zlib.crc32(scene.name.encode()), number)
-    photo = _photo(config, scene)
-    starts = {name: _start(config, scene, name, rng) for name in names}
-    placed = {name: photo.T_world_camera @ start for name, start in starts.items() if start is not None}
-    *_, last = estimate_photo(models, [photo], names, rng, PhotoConfig(placed, config.loss))
-    scores = []
-    for found in last.found:
-        moved = replace(found, best=replace(found.best, pose=photo.T_world_camera.inverse() @ found.best.pose))
-        write_sheet(config.folder / f"{scene.name}-{found.name}-{number}.png", models, scene.photo, moved)
-        scores.append(_score(renderer, scene, moved, mask_iou(photo, scene.photo, found.name)))
-    return scores
 
 
 def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject, mask_iou: float) -> PhotoScore:
@@ -503,7 +464,10 @@ def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject, mask
 def _photo(config: EvaluatePhotos, scene: PhotoFolder) -> Photograph:
     photo = scene.photo
     if config.masks == "boxes":
-        photo = photo.with_masks(masks_from_boxes(scene))
+        encoded = scene.encoded if scene.encoded.dtype == np.uint8 else (scene.encoded // 257).astype(np.uint8)
+        marks = {name: box_and_click(mask) for name, mask in photo.masks.items()}
+        boxes, clicks = ({name: mark[k] for name, mark in marks.items()} for k in (0, 1))
+        photo = photo.with_masks(propose_masks(np.ascontiguousarray(encoded), boxes, clicks))
     if config.mask_error_px:
         kernel = np.ones((2 * config.mask_error_px + 1,) * 2, np.uint8)
         change = (cv2.dilate, cv2.erode)

@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from jaxtyping import Float
 from osfcore.dynamics.shapes import ObjectShape, solid_shape
 from osfcore.errors import check_ranges, check_seed
 from osfcore.experiments.harness import EvaluationStep, torch_in_one_thread
-from osfcore.experiments.statistics import compare_means, compare_shares, mean_interval, share_interval
+from osfcore.experiments.statistics import compare_means, compare_shares, mean_interval, share_interval, spread
 from osfcore.extras import need
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
@@ -140,14 +140,14 @@ class Simulation(_Plane):
         self, states: Float[np.ndarray, "K 7"], velocities: Float[np.ndarray, "K 2"]
     ) -> Float[np.ndarray, "K 7"]:
         """Return the states after one action each [m/s]."""
-        return np.array([self._after(state, velocity) for state, velocity in zip(states, velocities, strict=True)])
-
-    def _after(self, state: Float[np.ndarray, "7"], velocity: Float[np.ndarray, "2"]) -> Float[np.ndarray, "7"]:
-        self._forget_contacts()
-        self._put(state.tolist())
-        for _ in range(self._steps):
-            self._follow(*self._target(velocity))
-        return self.state
+        after = []
+        for state, velocity in zip(states, velocities, strict=True):
+            self._forget_contacts()
+            self._put(state.tolist())
+            for _ in range(self._steps):
+                self._follow(*self._target(velocity))
+            after.append(self.state)
+        return np.array(after)
 
     def _forget_contacts(self) -> None:
         """Let a moment pass in which nothing is near anything, and keep no contact from before it."""
@@ -235,7 +235,13 @@ def report_json(episodes: Sequence[PushTEpisode]) -> dict[str, Any]:
         "tasks": len(first),
         "start_mean": float(np.mean([episode.start for episode in first])),
         "planners": {name: _figures(rows) for name, rows in planners.items()},
-        "against": {name: _against(ours, rows) for name, rows in others.items()},
+        "against": {
+            name: {
+                "success": compare_shares([e.is_success for e in ours], [e.is_success for e in rows]),
+                "coverage": compare_means([e.coverage for e in ours], [e.coverage for e in rows]),
+            }
+            for name, rows in others.items()
+        },
         "episodes": [{key: getattr(e, key) for key in keys} for e in episodes],
     }
 
@@ -256,22 +262,10 @@ def _figures(episodes: Sequence[PushTEpisode]) -> dict[str, Any]:
     }
 
 
-def _times(seconds: Sequence[float], what: str) -> dict[str, float]:
-    return {
-        f"{what}_hz": 1 / float(np.mean(seconds)),
-        f"{what}_s_mean": float(np.mean(seconds)),
-        f"{what}_s_median": float(np.median(seconds)),
-        f"{what}_s_p90": float(np.quantile(seconds, 0.9)),
-        f"{what}_s_p99": float(np.quantile(seconds, 0.99)),
-        f"{what}_s_most": max(seconds),
-    }
-
-
-def _against(ours: Sequence[PushTEpisode], others: Sequence[PushTEpisode]) -> dict[str, Any]:
-    return {
-        "success": compare_shares([e.is_success for e in ours], [e.is_success for e in others]),
-        "coverage": compare_means([e.coverage for e in ours], [e.coverage for e in others]),
-    }
+def _times(seconds: Sequence[float], what: str) -> dict[str, float | None]:
+    mean_s = float(np.mean(seconds))
+    tail = spread(f"{what}_s", seconds, ("mean", "median", "p90", "p99"))
+    return {f"{what}_hz": 1 / mean_s, **tail, f"{what}_s_most": max(seconds)}
 
 
 # The plane of Push-T as our table: the T is an object that lies on it, the pusher is ours.
@@ -367,85 +361,70 @@ class Problem:
     horizon: int
 
 
-class Planner(Protocol):
-    """Plans again before every action."""
-
-    def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
-        """Return the next action in a state of the plane [m/s]."""
-        ...
+# Returns the next action in a state of the plane [m/s], planned anew.
+Planner = Callable[[Float[np.ndarray, "7"]], Float[np.ndarray, "2"]]
 
 
-class OurPlanner:
-    """MPPI with straight push proposals; as it ships, but that plans are not recombined nor judged over begins."""
+def our_planner(problem: Problem, rng: np.random.Generator) -> Planner:
+    """Return MPPI with straight push proposals: as it ships, but plans are not recombined nor judged over begins."""
+    futures, samples = _Futures(problem.step), (problem.samples - COMPARED) // 2
+    settings = PlanSettings(samples, problem.horizon, recombined=0, begins_m=0.0)
+    planner = MPPIPlanner(futures, PushProposals({NAME: tee_shape()}), settings)
 
-    def __init__(self, problem: Problem, rng: np.random.Generator) -> None:
-        self._futures, self._goal, self._rng = _Futures(problem.step), problem.goal, rng
-        samples = (problem.samples - COMPARED) // 2
-        settings = PlanSettings(samples, problem.horizon, recombined=0, begins_m=0.0)
-        self._planner = MPPIPlanner(self._futures, PushProposals({NAME: tee_shape()}), settings)
-
-    def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
-        """Return the next action [m/s]."""
-        scene = self._futures.begin(state)
-        *_, last = self._planner.plan(scene, self._goal, cost_of(self._goal), self._rng)
-        self._planner.shift(1)
+    def plan(state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
+        *_, last = planner.plan(futures.begin(state), problem.goal, cost_of(problem.goal), rng)
+        planner.shift(1)
         return last.actions[0, :2]
 
+    return plan
 
-class PaperPlanner:
-    """Gaussian MPPI of the paper."""
 
-    def __init__(self, problem: Problem, rng: np.random.Generator) -> None:
-        self._futures, self._goal, self._rng = _Futures(problem.step), problem.goal, rng
-        settings = GaussianPlanSettings(samples=problem.samples, horizon=problem.horizon, noise_m_s=NOISE_M_S)
-        self._planner = GaussianMPPI(self._futures, settings)
+def paper_planner(problem: Problem, rng: np.random.Generator) -> Planner:
+    """Return the Gaussian MPPI of the paper."""
+    futures = _Futures(problem.step)
+    settings = GaussianPlanSettings(samples=problem.samples, horizon=problem.horizon, noise_m_s=NOISE_M_S)
+    planner = GaussianMPPI(futures, settings)
 
-    def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
-        """Return the next action [m/s]."""
-        actions = self._planner.plan(self._futures.begin(state), cost_of(self._goal), self._rng).actions
-        self._planner.shift()
+    def plan(state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
+        actions = planner.plan(futures.begin(state), cost_of(problem.goal), rng).actions
+        planner.shift()
         return actions[0, :2]
 
+    return plan
 
-class PytorchMPPI:
-    """`MPPI` of pytorch-mppi (University of Michigan), begun at rest; it adds its own cost of actions.
 
-    It draws from torch's global generator, so `rng` is left alone.
+def pytorch_mppi(problem: Problem, _rng: np.random.Generator) -> Planner:
+    """Return `MPPI` of pytorch-mppi (University of Michigan), begun at rest; it adds its own cost of actions.
+
+    It draws from torch's global generator.
 
     Raises:
         MissingExtra: if it is not installed.
     """
+    need("pusht", "Push-T")
+    from pytorch_mppi import MPPI  # pyright: ignore[reportMissingImports]  an extra
 
-    def __init__(self, problem: Problem, rng: np.random.Generator) -> None:
-        need("pusht", "Push-T")
-        from pytorch_mppi import MPPI  # pyright: ignore[reportMissingImports]  an extra
+    cost = cost_of(problem.goal)
 
-        cost = cost_of(problem.goal)
+    def dynamics(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(problem.step(states.numpy(), actions.numpy()))
 
-        def dynamics(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-            return torch.from_numpy(problem.step(states.numpy(), actions.numpy()))
+    def cost_of_all(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        after = states[0].numpy()  # K x T, without the state before; the cost leaves the first one out
+        return torch.from_numpy(cost(rollouts_of(np.concatenate([after[:, :1], after], axis=1))))
 
-        def no_cost(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-            return states.new_zeros(len(states))
-
-        def cost_of_all(states: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-            after = states[0].numpy()  # K x T, without the state before; the cost leaves the first one out
-            return torch.from_numpy(cost(rollouts_of(np.concatenate([after[:, :1], after], axis=1))))
-
-        limit = torch.full((2,), MAX_SPEED_M_S, dtype=torch.float64)
-        self._planner: Any = MPPI(
-            dynamics, no_cost, STATE, NOISE_M_S**2 * torch.eye(2, dtype=torch.float64),
-            num_samples=problem.samples, horizon=problem.horizon, terminal_state_cost=cost_of_all,
-            lambda_=PYTORCH_MPPI_LAMBDA, u_min=-limit, u_max=limit,
-            U_init=torch.zeros(problem.horizon, 2, dtype=torch.float64),
-        )  # fmt: skip
-
-    def plan(self, state: Float[np.ndarray, "7"]) -> Float[np.ndarray, "2"]:
-        """Return the next action [m/s]."""
-        return self._planner.command(state).numpy().clip(-MAX_SPEED_M_S, MAX_SPEED_M_S)
+    limit = torch.full((2,), MAX_SPEED_M_S, dtype=torch.float64)
+    planner: Any = MPPI(
+        dynamics, lambda states, _actions: states.new_zeros(len(states)), STATE,
+        NOISE_M_S**2 * torch.eye(2, dtype=torch.float64),
+        num_samples=problem.samples, horizon=problem.horizon, terminal_state_cost=cost_of_all,
+        lambda_=PYTORCH_MPPI_LAMBDA, u_min=-limit, u_max=limit,
+        U_init=torch.zeros(problem.horizon, 2, dtype=torch.float64),
+    )  # fmt: skip
+    return lambda state: planner.command(state).numpy().clip(-MAX_SPEED_M_S, MAX_SPEED_M_S)
 
 
-PLANNERS = {_OURS: OurPlanner, "paper": PaperPlanner, "pytorch_mppi": PytorchMPPI}
+PLANNERS = {_OURS: our_planner, "paper": paper_planner, "pytorch_mppi": pytorch_mppi}
 
 
 class _Futures:
@@ -554,6 +533,6 @@ def _episode(
 def _timed_plan(planner: Planner, state: Float[np.ndarray, "7"], seconds: list[float]) -> Float[np.ndarray, "2"]:
     """Return the next action [m/s], and note how long the plan took."""
     start = time.perf_counter()
-    action = planner.plan(state)
+    action = planner(state)
     seconds.append(time.perf_counter() - start)
     return action

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,8 @@ from osfcore.control.events import (
 from osfcore.dynamics.graph import read_network
 from osfcore.dynamics.rollout import PushModel, network_path, shipped
 from osfcore.errors import InvalidInput
-from osfcore.experiments.dynamics_scores import MOVED_DEG, MOVED_MM
+from osfcore.experiments.charts import Axis, Chart, cumulative, write_charts
+from osfcore.experiments.dynamics import MOVED_DEG, MOVED_MM
 from osfcore.experiments.factors import UNSEEN_NETWORK, Factor, factor_named
 from osfcore.experiments.harness import (
     EvaluationStep,
@@ -48,8 +49,7 @@ from osfcore.experiments.harness import (
     finished,
     table_sha256,
 )
-from osfcore.experiments.methods import field_path, known_names
-from osfcore.experiments.rearrangement_report import MpcReport, write_pictures
+from osfcore.experiments.images import field_path, known_names
 from osfcore.experiments.rearrangement_runs import (
     Ended,
     TrueState,
@@ -61,15 +61,25 @@ from osfcore.experiments.rearrangement_runs import (
 )
 from osfcore.experiments.rivals.fitvid import fitvid_path, read_fitvid
 from osfcore.experiments.rivals.visual_foresight import Foreseen, ForesightSettings, run_visual_foresight
+from osfcore.experiments.statistics import (
+    compare_means,
+    compare_shares,
+    mean,
+    mean_interval,
+    median,
+    rounded,
+    share_interval,
+)
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S
-from osfcore.inspection.contact_sheet import Comparison
+from osfcore.inspection.contact_sheet import Comparison, contact_sheet
 from osfcore.io.files import write_json
-from osfcore.io.image_file import to_uint8
+from osfcore.io.image_file import to_uint8, write_png
+from osfcore.io.json_codec import decode
 from osfcore.metrics.pose_errors import rotation_error
-from osfcore.metrics.success import RearrangementScore, RearrangementTask, score_of
+from osfcore.metrics.success import SUCCESS_M, RearrangementScore, RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics import weights_path
@@ -232,64 +242,240 @@ class _Log:
         """Take note of all events of an episode; the last of them, how it ended, is returned."""
         began, ended = time.perf_counter(), None
         for event in events:
-            if isinstance(event, Ended):
-                ended = event
-            else:
-                self.take(event)
+            match event:
+                case GoalFound():
+                    if event.estimate is not None:
+                        self.figures["goal_doubt"] = event.estimate.reason
+                        offsets = event.goal.offsets_m(self._task.goal)
+                        self.figures["goal_mm"] = 1000 * float(np.linalg.norm(offsets, axis=1).max())
+                case Noticed():
+                    self.figures["noticed"].append([event.number, event.matter, event.text])
+                case TrueState():
+                    self._truth = event.state
+                case ActionExecuted():
+                    self.course.actions[event.number] = event.action
+                case Stepped():
+                    self.course.estimated[event.number] = event.estimate.state
+                    if self._truth is not None:
+                        self.course.true[event.number] = self._truth
+                    if event.number == 0:  # means over all objects
+                        start = self._task.start
+                        score = score_of(replace(self._task, goal=start), event.estimate.state, self._symmetries)
+                        self.figures["first_mm"] = float(np.mean([one.mm for one in score.objects]))
+                        self.figures["first_deg"] = float(np.mean([one.deg for one in score.objects]))
+                        turn_rad = event.estimate.state.light.angle_to(start.light)
+                        self.figures["light_deg"] = float(np.rad2deg(turn_rad))
+                    for stage, seconds in event.seconds.items():
+                        self._seconds.setdefault(stage, []).append(seconds)
+                case Foreseen():
+                    self._seconds.setdefault("plan", []).append(event.plan.seconds)
+                    self._note_end("out of steps", event.number + 1)
+                case Finished():
+                    self._note_end(event.outcome, event.number)
+                case Ended():
+                    ended = event
+                case _:
+                    pass
         assert ended is not None  # for the type checker
         self.figures["episode_s"] = round(time.perf_counter() - began, 2)
         return ended
 
-    def take(self, event: Event | TrueState | Foreseen) -> None:
-        """Take note of an event."""
-        match event:
-            case GoalFound():
-                if event.estimate is not None:
-                    self.figures["goal_doubt"] = event.estimate.reason
-                    offsets = event.goal.offsets_m(self._task.goal)
-                    self.figures["goal_mm"] = 1000 * float(np.linalg.norm(offsets, axis=1).max())
-            case Noticed():
-                self.figures["noticed"].append([event.number, event.matter, event.text])
-            case TrueState():
-                self._truth = event.state
-            case ActionExecuted():
-                self.course.actions[event.number] = event.action
-            case Stepped():
-                self.course.estimated[event.number] = event.estimate.state
-                if self._truth is not None:
-                    self.course.true[event.number] = self._truth
-                if event.number == 0:
-                    self.figures |= self._first_errors(event.estimate.state)
-                for stage, seconds in event.seconds.items():
-                    self._seconds.setdefault(stage, []).append(seconds)
-            case Foreseen():
-                self._seconds.setdefault("plan", []).append(event.plan.seconds)
-                self._note_end("out of steps", event.number + 1)
-            case Finished():
-                self._note_end(event.outcome, event.number)
-            case _:
-                pass
-
     def _note_end(self, outcome: str, steps: int) -> None:
         self.figures |= {"outcome": outcome, "steps": steps, "robot_s": round(STEP_S * steps, 3)}
 
-    def _first_errors(self, state: SceneState) -> dict[str, float]:
-        """Return errors of the first estimate: means over all objects [mm, deg], and the angle of the light [deg]."""
-        start = self._task.start
-        score = score_of(replace(self._task, goal=start), state, self._symmetries)
-        return {
-            "first_mm": float(np.mean([one.mm for one in score.objects])),
-            "first_deg": float(np.mean([one.deg for one in score.objects])),
-            "light_deg": float(np.rad2deg(state.light.angle_to(start.light))),
-        }
-
     def summary(self) -> dict[str, Any]:
         """Return all figures, with the median time of each stage [s]."""
-        seconds = {}
-        for stage in ("first", "goal", "estimate", "plan"):
-            times = self._seconds.get(stage)
-            seconds[f"{stage}_s"] = round(float(np.median(times)), 3) if times else None
-        return {**self.figures, **seconds}
+        stages = ("first", "goal", "estimate", "plan")
+        return {**self.figures, **{f"{one}_s": rounded(median(self._seconds.get(one, ())), 3) for one in stages}}
+
+
+# Figures and pictures.
+
+
+CURVE_MM = (5, 10, 15, 20, 30, 40, 60, 80, 100)
+_LOOSE_DEG = 15.0
+_NEVER_MM = 1e6  # the error of a task in which something else was pushed away
+_CHART_MM, _CHART_6D = 60.0, 0.6
+_PER_ROW = 10
+_DISTANCES = ("pose6d", "pose6d_symmetric")
+_Test = Callable[[RearrangementScore], bool]
+_TESTS: dict[str, _Test] = {
+    "success_tight": RearrangementScore.is_tight,
+    "success_2cm": RearrangementScore.is_success,
+    "success_2cm_15deg": lambda score: score.is_success(SUCCESS_M, _LOOSE_DEG),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class MpcReport:
+    """Results of all tasks, in their order.
+
+    Attributes:
+        ours: of the method, which sees images.
+        oracle: of the planner that knows the truth.
+        may_refuse: whether nothing is moved where the goal is doubted, as ours ships; a doubt of our loop about what
+            another method's fields show counts for nothing.
+    """
+
+    ours: tuple[TaskResult, ...]
+    oracle: tuple[TaskResult, ...]
+    may_refuse: bool = True
+
+    @cached_property
+    def overruled(self) -> list[RearrangementScore]:
+        """How our tables ended, where doubts about the goal were overruled."""
+        return scores_of(self.ours, "score")
+
+    @cached_property
+    def nothing(self) -> list[RearrangementScore]:
+        """How they are without any action."""
+        return scores_of(self.ours, "noaction")
+
+    @cached_property
+    def shipped(self) -> list[RearrangementScore]:
+        """How the method's tables end: ours moves nothing where the goal is doubted."""
+        if not self.may_refuse:
+            return self.overruled
+        trio = zip(self.ours, self.overruled, self.nothing, strict=True)
+        return [nothing if result.figures["goal_doubt"] else overruled for result, overruled, nothing in trio]
+
+    @cached_property
+    def told_truth(self) -> list[RearrangementScore]:
+        """How the oracle's tables ended."""
+        return scores_of(self.oracle, "score")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures; lengths in mm, angles in degrees, shares in [0, 1]."""
+        scores, nothing = self.shipped, self.nothing
+        final = [score.moved_mm for score in scores]
+        rejected = [result.figures["rejected"] for result in self.ours]
+        reasons = sorted({reason for one in rejected for reason in one})
+        # Until the loop ended, over tasks within 2 cm.
+        robot_s = [one.figures["robot_s"] for one, score in zip(self.ours, scores, strict=True) if score.is_success()]
+        # The share of tight successes after one try, after two, and so on: whether more still help.
+        pairs = list(zip(self.told_truth, [one.figures["tries"] for one in self.oracle], strict=True))
+        most = max((tries for _, tries in pairs), default=0)
+        by_try = [_share(pairs, lambda one, n=n: one[0].is_tight() and one[1] <= n) for n in range(1, most + 1)]
+        return {
+            "tasks": len(scores),
+            **_figures(scores, ""),
+            **_figures(self.told_truth, "oracle_"),
+            **_figures(nothing, "noaction_"),
+            **{f"{key}_overruled": _share(self.overruled, test) for key, test in _TESTS.items()},
+            "refused": sum(bool(result.figures["goal_doubt"]) for result in self.ours),
+            "success_by_moved": self._by_moved(_TESTS["success_2cm"]),
+            "success_tight_by_moved": self._by_moved(_TESTS["success_tight"]),
+            "success_curve": {str(mm): _share(scores, lambda s, mm=mm: s.is_success(mm / 1000)) for mm in CURVE_MM},
+            "final_mm_mean": rounded(mean(final), 2),
+            "final_mm_median": rounded(median(final), 2),
+            "final_deg_median": rounded(median(score.moved_deg for score in scores), 2),
+            "start_mm_mean": rounded(mean(score.moved_mm for score in nothing), 1),
+            "oracle_success_tight_by_try": by_try if self.oracle else None,
+            "oracle_final_mm_mean": rounded(mean(score.moved_mm for score in self.told_truth), 2),
+            "seconds_robot_median": rounded(median(robot_s), 2),
+            **{f"{name}_s_median": self._median(f"{key}_s") for name, key in _STAGES.items()},
+            "steps_median": self._median("steps"),
+            **self._own_pushes(),
+            **{f"{key}_median": self._median(key) for key in ("goal_mm", "first_mm", "first_deg", "light_deg")},
+            "against_noaction": paired(scores, nothing),
+            "against_oracle": paired(scores, self.told_truth) if self.oracle else None,
+            "by_object": _by_object(scores),
+            "rejected_layouts": {reason: sum(one.get(reason, 0) for one in rejected) for reason in reasons},
+        }
+
+    def _by_moved(self, test: _Test) -> dict[str, float | None]:
+        counts = sorted({len(score.moved) for score in self.shipped})
+        return {str(n): _share([score for score in self.shipped if len(score.moved) == n], test) for n in counts}
+
+    def _own_pushes(self) -> dict[str, Any]:
+        """Return how well our own pushes were predicted four actions ahead, from estimated poses."""
+        figures: dict[str, Any] = {}
+        for unit in ("mm", "deg"):
+            values = [value for result in self.ours for value in result.figures["predicted"][unit]]
+            figures[f"own_pushes_mean_{unit}_4"] = rounded(mean(values), 2)
+            figures[f"own_pushes_median_{unit}_4"] = rounded(median(values), 2)
+            figures["own_pushes"] = len(values)
+        return figures
+
+    def _median(self, key: str) -> float | None:
+        return rounded(median(result.figures[key] for result in self.ours), 3)
+
+
+_STAGES = {"replan": "plan", "estimate": "estimate", "first": "first", "goal": "goal", "episode": "episode"}
+
+
+def _figures(scores: Sequence[RearrangementScore], who: str) -> dict[str, Any]:
+    """Return the figures that the method, the oracle and doing nothing all have; None without scores."""
+    figures: dict[str, Any] = {}
+    for key, test in _TESTS.items():
+        interval = share_interval(sum(test(score) for score in scores), len(scores)) if scores else None
+        figures[who + key] = _share(scores, test)
+        figures[f"{who}{key}_interval"] = rounded(interval, 3)
+    for key in _DISTANCES:
+        values = [getattr(score, key) for score in scores]
+        figures[f"{who}{key}_mean"] = rounded(mean(values), 4)
+        figures[f"{who}{key}_median"] = rounded(median(values), 4)
+        figures[f"{who}{key}_mean_interval"] = rounded(mean_interval(values), 4)
+    return figures
+
+
+def paired(ours: Sequence[RearrangementScore], others: Sequence[RearrangementScore]) -> dict[str, Any]:
+    """Compare two methods task by task: differences with intervals, and McNemar's test of the shares."""
+    both = ours, others
+    shares = {key: [[_TESTS[key](s) for s in them] for them in both] for key in ("success_tight", "success_2cm")}
+    distances = {key: [[getattr(s, key) for s in them] for them in both] for key in _DISTANCES}
+    found = {key: compare_shares(*sides) for key, sides in shares.items()}
+    return found | {key: compare_means(*sides) for key, sides in distances.items()}
+
+
+def _by_object(scores: Sequence[RearrangementScore]) -> dict[str, dict[str, float | None]]:
+    """Return how each object ended where it had to move."""
+    moved = [one for score in scores for one in score.moved]
+    rows = {name: [one for one in moved if one.name == name] for name in sorted({one.name for one in moved})}
+    return {
+        name: {
+            "moved": len(ends),
+            "tight": rounded(mean(end.is_tight() for end in ends), 4),
+            "within_2cm": rounded(mean(end.is_within(SUCCESS_M, np.inf) for end in ends), 4),
+            "mm_median": rounded(median(end.mm for end in ends), 2),
+            "deg_median": rounded(median(end.deg for end in ends), 2),
+        }
+        for name, ends in rows.items()
+    }
+
+
+def scores_of(results: Sequence[TaskResult], key: str) -> list[RearrangementScore]:
+    """Return the scores among the figures of results."""
+    return [decode(RearrangementScore, result.figures[key], "score") for result in results]
+
+
+def write_pictures(folder: Path, report: MpcReport) -> None:
+    """Draw mpc.png, success by threshold and errors of 6D poses, and mpc_tasks.png, goals and what was reached.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    kinds = {"from images": report.shipped, "no action": report.nothing}
+    if report.oracle:
+        kinds["told the truth"] = report.told_truth
+    share, mm, sixd = Axis("share of tasks", 0, 1), Axis("threshold [mm]", 0, _CHART_MM), Axis("distance", 0, _CHART_6D)
+    farthest = {
+        name: [max(one.mm for one in s.moved) if s.others_mm <= 1000 * SUCCESS_M else _NEVER_MM for s in scores]
+        for name, scores in kinds.items()
+    }
+    reached = [cumulative(name, errors, mm) for name, errors in farthest.items()]
+    poses = [cumulative(name, [score.pose6d for score in scores], sixd) for name, scores in kinds.items()]
+    charts = (Chart("Objects that had to move", mm, share, reached), Chart("6D poses, all objects", sixd, share, poses))
+    write_charts(folder / "mpc.png", charts)
+    shown = [comparison for result in report.ours for comparison in result.shown]
+    write_png(folder / "mpc_tasks.png", contact_sheet(shown, per_row=_PER_ROW, truth="goal"))
+
+
+def _share(scores: Sequence[Any], test: Callable[[Any], bool]) -> float | None:
+    return rounded(mean(test(score) for score in scores), 4)
+
+
+# The evaluation.
 
 
 REPORT_FILE = "mpc.json"
@@ -446,8 +632,7 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
         work = partial(episodes.by_foresight, settings=config.foresight, actions=settings.steps)
     else:
         work = partial(episodes.from_images, settings=settings, published=config.published)
-    plan = _plan_name(config.plan, type(config.plan)())
-    name = "-".join(part for part in (config.variant.name(), config.cost, plan, config.factor) if part)
+    name = _joined(config.variant.name(), config.cost, _plan_name(config.plan, type(config.plan)()), config.factor)
     kinds = {name: (work, {**own, "settings": asdict(settings), "plan": asdict(config.plan)})}
     if config.oracle:
         settings = replace(
@@ -455,8 +640,8 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
             renewed=False,
         )  # fmt: skip
         tries = config.oracle_tries
-        name = "-".join(part for part in ("oracle", _plan_name(config.oracle_plan, ORACLE_PLAN)) if part)
         work = partial(episodes.oracle, settings=settings, tries=tries)
+        name = _joined("oracle", _plan_name(config.oracle_plan, ORACLE_PLAN))
         kinds[name] = work, {"settings": asdict(settings), "tries": tries}
     folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
     return [
@@ -464,6 +649,10 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
         for kind, (work, circumstances) in kinds.items()
         for n in range(config.tasks)
     ]
+
+
+def _joined(*parts: str) -> str:
+    return "-".join(part for part in parts if part)
 
 
 def _plan_name(plan: Plan, usual: Plan) -> str:

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -81,7 +81,7 @@ class Variant:
 
     @property
     def fields(self) -> str:
-        """Whose fields it has: one of `methods.FIELD_METHODS`."""
+        """Whose fields it has: one of `images.FIELD_METHODS`."""
         return "paper" if self.published("fields") else "nerf" if self.method == "nerf" else "ours"
 
     def published(self, stage: StageName) -> bool:
@@ -96,8 +96,7 @@ class Variant:
         return "-".join(part for part in (self.method, *sorted(self.replaced), *true, views, masks) if part)
 
 
-@dataclass(frozen=True, slots=True)
-class LoopParts:
+class LoopParts(NamedTuple):
     """Models and estimators of a closed loop."""
 
     models: SceneModels
@@ -297,7 +296,7 @@ def run_told_the_truth(
     *,
     knows_pushes: bool,
 ) -> Ended:
-    """Run the same planner with true poses.
+    """Run the same planner with true poses until the goal is reached or all steps are done.
 
     Args:
         task: with the true goal.
@@ -317,38 +316,25 @@ def run_told_the_truth(
         camera = goal_camera()
         goal = GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
         world.restore(task.start)
-        _push_there(world, rollout, task, models, settings, rng)
+        planner = MPPIPlanner(rollout, PushProposals(models.shapes, models.pushes.rollout), settings.plan)
+        target, left = PoseGoal.of(task.start, {name: task.goal.pose(name) for name in task.moved}), settings.steps
+        while left > 0:
+            state = world.truth()
+            target = nearest_symmetric_goal(target, state, models.symmetries)
+            far, turned = offsets(target, state)
+            if far.max() <= settings.reached_m and turned.max() <= settings.reached_rad:
+                break
+            planner.settings = replace(settings.plan, horizon=min(settings.plan.horizon, left))
+            for _ in planner.plan(state, target, PoseCost(target), rng):
+                pass
+            actions = planner.nominal(min(settings.replan_every, left))
+            for action in actions:
+                world.act(action)
+            planner.shift(len(actions))
+            left -= len(actions)
         return _ended(world, goal)
 
 
-def _push_there(
-    world: Tabletop,
-    rollout: Rollout,
-    task: RearrangementTask,
-    models: SceneModels,
-    settings: EpisodeSettings,
-    rng: np.random.Generator,
-) -> None:
-    """Plan from true poses and push until the goal is reached or all steps are done."""
-    planner = MPPIPlanner(rollout, PushProposals(models.shapes, models.pushes.rollout), settings.plan)
-    goal, number = PoseGoal.of(task.start, {name: task.goal.pose(name) for name in task.moved}), 0
-    while number < settings.steps:
-        state = world.truth()
-        goal = nearest_symmetric_goal(goal, state, models.symmetries)
-        far, turned = offsets(goal, state)
-        if far.max() <= settings.reached_m and turned.max() <= settings.reached_rad:
-            return
-        left = settings.steps - number
-        planner.settings = replace(settings.plan, horizon=min(settings.plan.horizon, left))
-        for _ in planner.plan(state, goal, PoseCost(goal), rng):
-            pass
-        actions = planner.nominal(min(settings.replan_every, left))
-        for action in actions:
-            world.act(action)
-        planner.shift(len(actions))
-        number += len(actions)
-
-
-def _ended(world: Tabletop | VariedWorld, goal: GoalImage) -> Ended:
+def _ended(world: Tabletop, goal: GoalImage) -> Ended:
     image = world.render((goal.camera,), with_pusher=False).images[0]
     return Ended(world.truth(), image, goal.image)

@@ -7,11 +7,11 @@ know. Finished scenes are kept in the output folder, method by method: a killed 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -19,21 +19,20 @@ from jaxtyping import UInt8
 from osfcore.errors import InvalidInput
 from osfcore.experiments.charts import Axis
 from osfcore.experiments.fields import MEASURES, compare_scene, figures_of, mean_of, render_scene, simulate_relit
-from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult, check_run
-from osfcore.experiments.images import measured, summary, tables_of, write_comparison
-from osfcore.experiments.methods import (
+from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult
+from osfcore.experiments.images import (
     FIELD_METHODS,
     TITLES,
-    check_methods,
-    common_names,
+    CompareImages,
+    checked,
+    compare,
     load_appearance,
     shown_circumstances,
 )
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras
+from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.inspection.contact_sheet import image_grid
-from osfcore.io.image_file import write_png
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream
 from osfcore.world.tasks import Draw, draw_scene
@@ -45,35 +44,19 @@ VERSION = 1  # raised by hand when figures may change
 
 
 @dataclass(frozen=True, slots=True)
-class CompareRelighting:
-    """What to compare.
+class CompareRelighting(CompareImages):
+    """What to compare: scenes by some of `FIELD_METHODS`.
 
     Attributes:
-        folder: for results, pictures and relighting.json.
-        data_dir: where fields trained on this machine are.
-        names: objects to draw from; all with a mesh and a field of every method if None.
-        tasks: number of scenes.
-        seed: of the scenes.
-        methods: some of `FIELD_METHODS`.
-        objects: in each scene.
         elevations_deg: of the lights above the table.
-        size: side of the images [px].
     """
 
-    folder: Path
-    data_dir: Path
-    names: tuple[str, ...] | None = None
-    tasks: int = 20
-    seed: int = 0
-    methods: tuple[str, ...] = FIELD_METHODS
-    objects: int = 3
     elevations_deg: tuple[float, ...] = ELEVATIONS_DEG
-    size: int = DEFAULT_IMAGE_SIDE
 
 
 def compare_relighting(
     config: CompareRelighting, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
-) -> Iterator[EvaluationStep]:
+) -> Iterator[EvaluationStep[dict[str, Any]]]:
     """Show all scenes by all methods; the chart, images of the first scene and relighting.json go to `config.folder`.
 
     Args:
@@ -89,44 +72,27 @@ def compare_relighting(
         WorkerDied: if a worker process ended.
         CorruptFile, CannotWrite: as files are.
     """
-    config = _checked(config, fields, assets)
-    pieces = {
-        method: [_piece(config, method, number, fields, assets) for number in range(config.tasks)]
-        for method in config.methods
-    }
-    results = yield from measured(pieces, executor)
-    tables = tables_of(results, MEASURES)
-    spans = {ALL: range(len(config.elevations_deg))}
-    spans |= {f"{elevation:g}": [n] for n, elevation in enumerate(config.elevations_deg)}
-    about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "size")}
-    drawn_from = {"names": list(config.names or ()), "elevations_deg": list(config.elevations_deg)}
-    report = {**about, **drawn_from, **summary(tables, spans)}
-    x = Axis("light above the table [deg]", 0, 90)
-    files = config.folder / REPORT_FILE, config.folder / CHART_FILE
-    write_comparison(files, report, tables, x, config.elevations_deg)
-    write_png(config.folder / IMAGES_FILE, _first_scene(results))
-    total = config.tasks * len(config.methods)
-    yield EvaluationStep(total, total, "Everything is measured", report)
-
-
-def _checked(config: CompareRelighting, fields: FieldLibrary, assets: AssetLibrary) -> CompareRelighting:
-    """Return the same settings with methods, names and elevations in order."""
-    check_run(config.tasks, config.seed, size=config.size)
     elevations = tuple(sorted(set(config.elevations_deg)))
     if not elevations or not MIN_LIGHT_ELEVATION_DEG <= elevations[0] <= elevations[-1] <= 90:
         allowed = f"one or more between {MIN_LIGHT_ELEVATION_DEG:g} and 90"
         raise InvalidInput("elevations of the light [deg]", ", ".join(f"{e:g}" for e in elevations) or "none", allowed)
-    methods = check_methods(config.methods, FIELD_METHODS)
-    names = common_names(methods, config.names, fields, assets, config.data_dir, config.objects)
-    return replace(config, methods=methods, names=names, elevations_deg=elevations)
+    config = checked(replace(config, elevations_deg=elevations), FIELD_METHODS, fields, assets)
+    names = config.names or ()
 
+    def piece(method: str, number: int) -> Piece:
+        cache = TaskCache(config.folder / "relighting" / f"{config.objects}-{config.seed}" / method)
+        draw = draw_scene(names, config.objects, config.seed, number, Stream.RELIT_SCENE)
+        shown = shown_circumstances(draw, (method,), fields, assets, config.data_dir, config.size)
+        given = {"version": VERSION, "elevations_deg": elevations, **shown}
+        return Piece(f"{number:04d}", cache, given, partial(show_relit, config, draw, method, fields, assets))
 
-def _piece(config: CompareRelighting, method: str, number: int, fields: FieldLibrary, assets: AssetLibrary) -> Piece:
-    cache = TaskCache(config.folder / "relighting" / f"{config.objects}-{config.seed}" / method)
-    draw = draw_scene(config.names or (), config.objects, config.seed, number, Stream.RELIT_SCENE)
-    shown = shown_circumstances(draw, (method,), fields, assets, config.data_dir, config.size)
-    given = {"version": VERSION, "elevations_deg": config.elevations_deg, **shown}
-    return Piece(f"{number:04d}", cache, given, partial(show_relit, config, draw, method, fields, assets))
+    about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "size")}
+    spans = {ALL: range(len(elevations)), **{f"{elevation:g}": [n] for n, elevation in enumerate(elevations)}}
+    yield from compare(
+        config, piece, executor, files=(REPORT_FILE, CHART_FILE, IMAGES_FILE),
+        about={**about, "names": list(names), "elevations_deg": list(elevations)}, measures=MEASURES, spans=spans,
+        x=Axis("light above the table [deg]", 0, 90), places=elevations, picture=_picture,
+    )  # fmt: skip
 
 
 def show_relit(
@@ -137,7 +103,7 @@ def show_relit(
     Args:
         config: size of the images, elevations of the lights, and where fields of other methods may be.
         draw: the scene; its light has the azimuth of all lights.
-        method: one of `osfcore.experiments.methods.FIELD_METHODS`.
+        method: one of `FIELD_METHODS`.
         fields: ours, and the table.
         assets: meshes for the simulator.
 
@@ -164,8 +130,8 @@ def show_relit(
     )
 
 
-def _first_scene(results: Mapping[str, Sequence[TaskResult]]) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw the first scene: a row for each light; the truth, then the methods."""
-    shown = [part[0].shown for part in results.values()]
-    rows = {lights[0].label: [lights[0].truth, *(one.ours for one in lights)] for lights in zip(*shown, strict=True)}
+def _picture(results: Mapping[str, TaskResult]) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw a scene: a row for each light; the truth, then the methods."""
+    lit = zip(*(result.shown for result in results.values()), strict=True)
+    rows = {shown[0].label: [shown[0].truth, *(one.ours for one in shown)] for shown in lit}
     return image_grid(rows, ("simulator", *(TITLES[method] for method in results)))

@@ -41,18 +41,20 @@ def spread(name: str, values: Sequence[float], of: Sequence[str]) -> dict[str, f
         of: some of "mean", "median", "p90", "p95", "p99" and "max".
     """
 
-    def statistic(what: str) -> float | None:
-        match what:
-            case "mean":
-                return mean(values)
-            case "median":
-                return median(values)
-            case "max":
-                return float(max(values)) if values else None
-            case _:
-                return quantile(values, int(what[1:]) / 100)
+    def most(values: Sequence[float]) -> float | None:
+        return float(max(values)) if values else None
 
-    return {f"{name}_{what}": statistic(what) for what in of}
+    known = {"mean": mean, "median": median, "max": most}
+    return {
+        f"{name}_{what}": known[what](values) if what in known else quantile(values, int(what[1:]) / 100) for what in of
+    }
+
+
+def rounded(value: Any, digits: int) -> Any:  # noqa: ANN401 - a number, several of them, or None
+    """Round a number, or each of several, to so many digits after the point; None stays None."""
+    if isinstance(value, list | tuple):
+        return [rounded(one, digits) for one in value]
+    return None if value is None else round(value, digits)
 
 
 def share_interval(successes: int, tasks: int) -> tuple[float, float]:
@@ -91,35 +93,28 @@ def compare_shares(ours: Sequence[bool], others: Sequence[bool]) -> dict[str, An
         others: of the other one.
 
     Returns:
-        "difference" of the shares, Newcombe's 95 % "interval" of a paired difference, and "p" of McNemar's exact test:
+        "difference" of the shares, its 95 % "interval" (Newcombe 1998, method 10), and "p" of McNemar's exact test:
         how likely tasks in which only one of both succeeds are shared out so unevenly if both are equally good.
     """
     pairs = list(zip(ours, others, strict=True))
     both, neither = pairs.count((True, True)), pairs.count((False, False))
     only_ours, only_others = pairs.count((True, False)), pairs.count((False, True))
-    differing = only_ours + only_others
-    return {
-        "difference": (only_ours - only_others) / len(pairs),
-        "interval": list(_newcombe(both, only_ours, only_others, neither)),
-        "p": float(binomtest(only_ours, differing).pvalue) if differing else 1.0,
-    }
-
-
-def _newcombe(both: int, only_ours: int, only_others: int, neither: int) -> tuple[float, float]:
-    """Return the interval of the difference of two paired shares (Newcombe 1998, method 10)."""
-    tasks = both + only_ours + only_others + neither
-    ours, others = both + only_ours, both + only_others
-    (low, high), (other_low, other_high) = share_interval(ours, tasks), share_interval(others, tasks)
-    below, above = ours / tasks - low, high - ours / tasks
-    other_below, other_above = others / tasks - other_low, other_high - others / tasks
-    scale = np.sqrt(float(ours * others) * (tasks - ours) * (tasks - others))
+    tasks, mine, theirs = len(pairs), both + only_ours, both + only_others
+    (low, high), (other_low, other_high) = share_interval(mine, tasks), share_interval(theirs, tasks)
+    below, above = mine / tasks - low, high - mine / tasks
+    other_below, other_above = theirs / tasks - other_low, other_high - theirs / tasks
+    scale = np.sqrt(float(mine * theirs) * (tasks - mine) * (tasks - theirs))
     excess = both * neither - only_ours * only_others
     corrected = max(excess - tasks / 2, 0) if excess > 0 else excess
     phi = corrected / scale if scale else 0.0
-    difference = (only_ours - only_others) / tasks
+    difference, differing = (only_ours - only_others) / tasks, only_ours + only_others
     down = np.sqrt(below**2 - 2 * phi * below * other_above + other_above**2)
     up = np.sqrt(above**2 - 2 * phi * above * other_below + other_below**2)
-    return float(difference - down), float(difference + up)
+    return {
+        "difference": difference,
+        "interval": [float(difference - down), float(difference + up)],
+        "p": float(binomtest(only_ours, differing).pvalue) if differing else 1.0,
+    }
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -7,11 +7,10 @@ folder, method by method: a killed comparison goes on where it was.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,18 +22,17 @@ from osfcore.errors import InvalidInput
 from osfcore.experiments.charts import Axis
 from osfcore.experiments.estimation_tasks import episode, first_frame, take_frame
 from osfcore.experiments.fields import SCENE_QUALITY
-from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult, check_run, file_sha256
-from osfcore.experiments.images import measured, summary, tables_of, write_comparison
-from osfcore.experiments.methods import TITLES, check_methods, common_names, shown_circumstances
+from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult, file_sha256
+from osfcore.experiments.images import TITLES, CompareImages, checked, compare, shown_circumstances
 from osfcore.experiments.rearrangement_runs import Variant, loop_parts
 from osfcore.experiments.rivals.fitvid import fitvid_path, read_fitvid
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, default_cameras, goal_camera
+from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG
 from osfcore.geometry.rollouts import MAX_HORIZON
 from osfcore.geometry.states import Observation
 from osfcore.inspection.contact_sheet import Comparison, image_grid
-from osfcore.io.image_file import to_uint8, write_png
+from osfcore.io.image_file import to_uint8
 from osfcore.metrics.image_errors import psnr, ssim
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.dynamics import weights_path
@@ -106,30 +104,15 @@ VERSION = 1  # raised by hand when figures may change
 
 
 @dataclass(frozen=True, slots=True)
-class CompareVideos:
-    """What to compare.
+class CompareVideos(CompareImages):
+    """What to compare: episodes by some of `VIDEO_METHODS`, in frames of the side that FitVid's network has.
 
     Attributes:
-        folder: for results, pictures and video.json.
-        data_dir: where fields and networks trained on this machine are.
-        names: objects to draw from; all with a mesh and a field of every method if None.
-        tasks: number of episodes.
-        seed: of the episodes.
-        methods: some of `VIDEO_METHODS`.
-        objects: in each scene.
         steps: actions of 0.2 s that are predicted.
-        size: side of the frames [px]; that of FitVid's network.
     """
 
-    folder: Path
-    data_dir: Path
-    names: tuple[str, ...] | None = None
-    tasks: int = 20
-    seed: int = 0
     methods: tuple[str, ...] = VIDEO_METHODS
-    objects: int = 3
     steps: int = 30
-    size: int = DEFAULT_IMAGE_SIDE
 
 
 def compare_videos(
@@ -150,62 +133,36 @@ def compare_videos(
         WorkerDied: if a worker process ended.
         CorruptFile, CannotWrite: as files are.
     """
-    config = _checked(config, fields, assets)
-    pieces = {method: _pieces(config, method, fields, assets) for method in config.methods}
-    results = yield from measured(pieces, executor)
-    tables = tables_of(results, MEASURES)
-    spans = {str(horizon): range(horizon) for horizon in sorted({min(h, config.steps) for h in HORIZONS})}
-    about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "steps", "size")}
-    report = {**about, "names": list(config.names or ()), **summary(tables, spans)}
-    x, places = Axis("predicted steps of 0.2 s", 0, config.steps), range(1, config.steps + 1)
-    files = config.folder / REPORT_FILE, config.folder / CHART_FILE
-    write_comparison(files, report, tables, x, places)
-    write_png(config.folder / IMAGES_FILE, _first_episode(results))
-    total = config.tasks * len(config.methods)
-    yield EvaluationStep(total, total, "Everything is measured", report)
-
-
-def _checked(config: CompareVideos, fields: FieldLibrary, assets: AssetLibrary) -> CompareVideos:
-    """Check everything, and return the settings with methods and names in order."""
-    check_run(config.tasks, config.seed, ("predicted steps", config.steps, 1, MAX_HORIZON), size=config.size)
-    methods = check_methods(config.methods, VIDEO_METHODS)
-    names = common_names(methods, config.names, fields, assets, config.data_dir, config.objects)
-    if "fitvid" in methods:
+    config = checked(config, VIDEO_METHODS, fields, assets, ("predicted steps", config.steps, 1, MAX_HORIZON))
+    if "fitvid" in config.methods:
         side = read_fitvid(fitvid_path(config.data_dir)).settings.side
         if side != config.size:
             raise InvalidInput("image size [px]", config.size, f"{side}, as FitVid's network has")
-    return replace(config, methods=methods, names=names)
+    names = config.names or ()
+    ours = network_path(config.data_dir)
+    paths = {"ours": ours, "nerf": ours, "paper": weights_path(config.data_dir), "fitvid": fitvid_path(config.data_dir)}
+    networks = {method: [file_sha256(paths[method])] for method in config.methods if method in paths}
 
-
-def _pieces(config: CompareVideos, method: str, fields: FieldLibrary, assets: AssetLibrary) -> list[Piece]:
-    given = {
-        "steps": config.steps,
-        "networks": [file_sha256(path) for path in _networks(method, config.data_dir)],
-        "version": VERSION,
-    }
-    cache = TaskCache(config.folder / "video" / f"{config.objects}-{config.seed}" / method)
-    pieces = []
-    for number in range(config.tasks):
-        names, stream = config.names or (), Stream.VIDEO_SCENE
-        draw = draw_scene(names, config.objects, config.seed, number, stream, MIN_LIGHT_ELEVATION_DEG)
-        # Shapes come from our fields in any case.
-        own = shown_circumstances(draw, ("ours", method), fields, assets, config.data_dir, config.size)
+    def piece(method: str, number: int) -> Piece:
+        cache = TaskCache(config.folder / "video" / f"{config.objects}-{config.seed}" / method)
+        draw = draw_scene(names, config.objects, config.seed, number, Stream.VIDEO_SCENE, MIN_LIGHT_ELEVATION_DEG)
+        given = {
+            "steps": config.steps,
+            "networks": networks.get(method, []),
+            "version": VERSION,
+            # Shapes come from our fields in any case.
+            **shown_circumstances(draw, ("ours", method), fields, assets, config.data_dir, config.size),
+        }
         work = partial(measure_video, config, fields, assets, number, draw, method)
-        pieces.append(Piece(f"{number:04d}", cache, {**given, **own}, work))
-    return pieces
+        return Piece(f"{number:04d}", cache, given, work)
 
-
-def _networks(method: str, data_dir: Path) -> list[Path]:
-    """Return the networks that a method's predictions depend on."""
-    match method:
-        case "copied":
-            return []
-        case "fitvid":
-            return [fitvid_path(data_dir)]
-        case "paper":
-            return [weights_path(data_dir)]
-        case _:
-            return [network_path(data_dir)]
+    about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "steps", "size")}
+    yield from compare(
+        config, piece, executor, files=(REPORT_FILE, CHART_FILE, IMAGES_FILE), about={**about, "names": list(names)},
+        measures=MEASURES,
+        spans={str(horizon): range(horizon) for horizon in sorted({min(h, config.steps) for h in HORIZONS})},
+        x=Axis("predicted steps of 0.2 s", 0, config.steps), places=range(1, config.steps + 1), picture=_picture,
+    )  # fmt: skip
 
 
 def measure_video(
@@ -277,9 +234,9 @@ def predict_through_fields(
     return np.clip(rendered.rgb[:, 0], 0, 1)
 
 
-def _first_episode(results: Mapping[str, Sequence[TaskResult]]) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the first episode: a row for the truth and for each method; some of the steps."""
-    shown = {TITLES[method]: part[0].shown for method, part in results.items()}
-    first = next(iter(shown.values()))
-    rows = {"simulator": [one.truth for one in first], **{who: [one.ours for one in row] for who, row in shown.items()}}
+def _picture(results: Mapping[str, TaskResult]) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw an episode: a row for the truth and for each method; some of the steps."""
+    first = next(iter(results.values())).shown
+    rows = {"simulator": [one.truth for one in first]}
+    rows |= {TITLES[method]: [one.ours for one in result.shown] for method, result in results.items()}
     return image_grid(rows, [one.label for one in first])

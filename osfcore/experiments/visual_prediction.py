@@ -63,7 +63,9 @@ def show_prediction(
         OverlappingObjects, InvalidInput: if the simulator cannot begin from the state.
         CannotWrite: if the disk refuses.
     """
-    states = predicted_states(request)
+    rollouts, k = request.rollouts, request.sequence
+    predicted = zip(rollouts.positions[k], rollouts.quaternions[k], rollouts.pusher[k], strict=True)
+    states = [SceneState(rollouts.names, Pose(p, q), request.state.light, pusher) for p, q, pusher in predicted]
     truth = None if assets is None else _simulated(request, assets)
     columns, psnrs = [], []
     for step, state in enumerate(states):
@@ -81,13 +83,6 @@ def show_prediction(
         write_png(request.folder / SHEET_FILE, sheet)
         write_json(request.folder / PSNR_FILE, {"camera": request.camera.name, "psnr": psnrs})
     yield Progress(len(states), len(states), "Everything is rendered")
-
-
-def predicted_states(request: VisualPrediction) -> list[SceneState]:
-    """Return the scene before the first and after each action."""
-    rollouts, k = request.rollouts, request.sequence
-    steps = zip(rollouts.positions[k], rollouts.quaternions[k], rollouts.pusher[k], strict=True)
-    return [SceneState(rollouts.names, Pose(p, q), request.state.light, pusher) for p, q, pusher in steps]
 
 
 def _simulated(request: VisualPrediction, assets: AssetLibrary) -> Iterator[Float[np.ndarray, "h w 3"]]:

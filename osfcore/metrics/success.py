@@ -131,11 +131,7 @@ def score_of(task: RearrangementTask, end: SceneState, symmetries: Mapping[str, 
         shift = float(np.linalg.norm(here.position - there.position))
         plain = float(rotation_angle(here.quaternion, there.quaternion))
         alike = rotation_error(symmetries[name], here.quaternion, there.quaternion)
-        distances = (float(np.hypot(shift, _quaternion_distance(angle))) for angle in (plain, alike))
+        # Two unit quaternions, the nearer of both signs, whose rotations differ by an angle are 2 sin(angle / 4) apart.
+        distances = (float(np.hypot(shift, float(2 * np.sin(angle / 4)))) for angle in (plain, alike))
         objects.append(ObjectScore(name, name in task.moved, 1000 * shift, float(np.rad2deg(alike)), *distances))
     return RearrangementScore(tuple(objects))
-
-
-def _quaternion_distance(angle_rad: float) -> float:
-    """Return the distance of two unit quaternions, the nearer of both signs, whose rotations differ by an angle."""
-    return float(2 * np.sin(angle_rad / 4))

@@ -1,7 +1,6 @@
 """Handmade scores, for figures and pictures that are made of them."""
 
-from osfcore.experiments.estimation import EstimateReport
-from osfcore.experiments.estimation_scores import FrameScore, ObjectScore, TrackScore
+from osfcore.experiments.estimation import EstimateReport, FrameScore, ObjectScore, TrackScore
 from osfcore.experiments.estimation_tasks import KINDS, BadScore
 
 

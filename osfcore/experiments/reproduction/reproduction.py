@@ -5,29 +5,32 @@ from __future__ import annotations
 import base64
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput, check_seed
 from osfcore.experiments import relighting, video_prediction
 from osfcore.experiments.charts import Axis, Bar, Chart, Curve, write_bars, write_charts
-from osfcore.experiments.harness import EvaluationStep, Piece, TaskResult, finished
-from osfcore.experiments.methods import FIELD_METHODS, TITLES, common_names
-from osfcore.experiments.rearrangement import EvaluateMpc, checked, episode_pieces, episodes_report, figures_of
-from osfcore.experiments.rearrangement_report import MpcReport, paired
-from osfcore.experiments.relighting import CompareRelighting, compare_relighting
-from osfcore.experiments.reproduction.sections import (
-    SECTIONS,
-    Scale,
-    Section,
-    SectionName,
-    objects_in_words,
-    sections_of,
+from osfcore.experiments.factors import EPISODE_FACTORS
+from osfcore.experiments.harness import EvaluationStep, finished
+from osfcore.experiments.images import FIELD_METHODS, TITLES, common_names
+from osfcore.experiments.rearrangement import (
+    EvaluateMpc,
+    MpcReport,
+    checked,
+    episode_pieces,
+    episodes_report,
+    figures_of,
+    paired,
 )
+from osfcore.experiments.rearrangement_runs import TRUTHS, Variant
+from osfcore.experiments.relighting import CompareRelighting, compare_relighting
+from osfcore.experiments.rivals.visual_foresight import ForesightSettings
 from osfcore.experiments.statistics import holm, share_interval
 from osfcore.experiments.video_prediction import CompareVideos, compare_videos
 from osfcore.extras import need
@@ -35,6 +38,193 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.io.files import write_atomically, write_json
 from osfcore.metrics.success import RearrangementScore
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.mppi import STEPS, GaussianPlanSettings
+from osfcore.paper.stages import StageName
+from osfcore.planning.mppi import PlanSettings
+from osfcore.world.tasks import Family
+
+# Which episodes the report shows: sections of cells, each of which is one method on one set of tasks.
+#
+# All cells with the same family and number of objects get the same tasks, so that any two can be compared task by task.
+# Cells that stand in several sections, such as ours in the usual world, are measured once.
+
+
+SectionName = Literal["methods", "families", "ablations", "ladder", "factors", "attribution"]
+SECTIONS: tuple[SectionName, ...] = get_args(SectionName)
+_LADDER: tuple[StageName, ...] = ("estimation", "dynamics", "planning", "fields")  # the order in which ours come in
+_METHODS = {
+    "ours": Variant(),
+    "as published": Variant("paper"),
+    "compositional NeRF": Variant("nerf"),
+    "visual foresight": Variant("foresight"),
+    "light overhead": Variant("overhead"),
+    "light known": Variant("known_light"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """How much is measured.
+
+    Attributes:
+        tasks: of each cell.
+        headline: of the methods with three objects.
+        counts: numbers of objects that the methods are compared with.
+        objects: in the scenes of all other sections.
+        settings: of the episodes.
+        published: how planning as published samples.
+        foresight: how visual foresight plans.
+        factors: of variation.
+        families: beside `shifted`, with three objects.
+        scenes: that fields are compared on.
+        videos: that predictions are compared on.
+        has_slow_cells: also the light overhead, two views, shorter plans, and ours with the published fields.
+    """
+
+    tasks: int = 50
+    headline: int = 100
+    counts: tuple[int, ...] = (2, 3, 4)
+    objects: int = 3
+    settings: EpisodeSettings = field(default_factory=lambda: EpisodeSettings(STEPS))
+    published: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
+    foresight: ForesightSettings = field(default_factory=ForesightSettings)
+    factors: tuple[str, ...] = EPISODE_FACTORS
+    families: tuple[Family, ...] = ("turned", "crowded", "relit")
+    scenes: int = 20
+    videos: int = 20
+    has_slow_cells: bool = True
+
+
+_FEW = EpisodeSettings(steps=12, plan=PlanSettings(samples=32, horizon=10))
+QUICK = Scale(
+    tasks=3, headline=3, counts=(1,), objects=1, settings=_FEW, published=GaussianPlanSettings(48, 8),
+    foresight=ForesightSettings(8, 6), factors=("light_low",), families=(), scenes=3,
+    videos=3, has_slow_cells=False,
+)  # fmt: skip
+
+
+class Cell(NamedTuple):
+    """One method on one set of tasks, with its label in tables and charts."""
+
+    label: str
+    config: EvaluateMpc
+
+
+class Section(NamedTuple):
+    """Cells that are compared.
+
+    Attributes:
+        name: of the section.
+        title: over it.
+        text: on what is compared.
+        cells: the first of which all others are compared with.
+    """
+
+    name: SectionName
+    title: str
+    text: str
+    cells: tuple[Cell, ...]
+
+
+def objects_in_words(count: int) -> str:
+    """Return words such as "1 object"."""
+    return f"{count} object{'s' * (count > 1)}"
+
+
+def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...] = SECTIONS) -> tuple[Section, ...]:
+    """Return all sections with two cells or more, in their order.
+
+    Args:
+        base: where results are kept, the objects to draw from, and the seed.
+        scale: how much is measured.
+        chosen: sections that are shown.
+    """
+    settings = scale.settings
+    base = replace(
+        base, tasks=scale.tasks, objects=scale.objects, settings=settings, actions=settings.steps, oracle=False,
+        published=scale.published, foresight=scale.foresight,
+    )  # fmt: skip
+    makers = {
+        "methods": _methods, "families": _families, "ablations": _ablations, "ladder": _ladder, "factors": _factors,
+        "attribution": _attribution,
+    }  # fmt: skip
+    sections = [section for name in SECTIONS if name in chosen for section in makers[name](base, scale)]
+    return tuple(section for section in sections if len(section.cells) > 1)
+
+
+def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
+    sections = []
+    for count in scale.counts:
+        tasks = scale.headline if count == scale.objects else scale.tasks
+        given = replace(base, objects=count, tasks=tasks, oracle=count == scale.objects)
+        cells = [
+            Cell(label, replace(given, variant=variant, oracle=given.oracle and label == "ours"))
+            for label, variant in _METHODS.items()
+            if scale.has_slow_cells or variant.method != "overhead"
+        ]
+        title = f"Success by threshold, {objects_in_words(count)} (Fig. 7)"
+        text = (
+            "Closed loops toward a goal image. All methods get the same tasks, and masks in the first frame alone, "
+            "also the one as published, whose own evaluation has them at every step (below, under ablations). "
+            "Compositional NeRFs and the two lights take the place of our fields and our estimate of the light in our "
+            "loop. Ours refuses goals that it doubts, and fails there; others refuse none: what our doubts would have "
+            "refused is counted beside them. Visual foresight has a FitVid of 7.4 million parameters, which learned "
+            "for 45 minutes on one core; this says little of the original's 302 million."
+        )
+        sections.append(Section("methods", title, text, tuple(cells)))
+    return sections
+
+
+def _families(base: EvaluateMpc, scale: Scale) -> list[Section]:
+    cells = [Cell(f"goals {family}", replace(base, family=family)) for family in ("shifted", *scale.families)]
+    text = "Harder goals: turned as well, in one another's places, photographed under another light."
+    return [Section("families", "Families of tasks", text, tuple(cells))]
+
+
+def _ablations(base: EvaluateMpc, scale: Scale) -> list[Section]:
+    plan = base.settings.plan
+    cells = [Cell("ours", base), Cell("1 view", replace(base, variant=Variant(views=1)))]
+    if scale.has_slow_cells:
+        cells.append(Cell("2 views", replace(base, variant=Variant(views=2))))
+        shorter = replace(plan, samples=plan.samples // 4), replace(plan, horizon=plan.horizon // 3)
+        for label, one in zip((f"K = {shorter[0].samples}", f"T = {shorter[1].horizon}"), shorter, strict=True):
+            cells.append(Cell(label, replace(base, settings=replace(base.settings, plan=one))))
+    cells.append(Cell("cost of rendered images", replace(base, cost="image")))
+    if scale.has_slow_cells:
+        cells.append(Cell("light overhead", replace(base, variant=Variant("overhead"))))
+    cells.append(Cell("as published", replace(base, variant=Variant("paper"))))
+    cells.append(Cell("as published, masks at every step", replace(base, variant=Variant("paper", has_masks=True))))
+    text = (
+        f"Ours has four views, K = {plan.samples} sequences of T = {plan.horizon} actions and a cost of poses. "
+        "Masks are given in the first frame alone, but for the last row: the paper's evaluation has them at every step."
+    )
+    return [Section("ablations", "Ablations", text, tuple(cells))]
+
+
+def _ladder(base: EvaluateMpc, scale: Scale) -> list[Section]:
+    cells = [Cell("as published", replace(base, variant=Variant("paper")))]
+    for count in range(1, len(_LADDER) - (not scale.has_slow_cells)):
+        variant = Variant("paper", frozenset(_LADDER[:count]))
+        cells.append(Cell(f"+ our {_LADDER[count - 1]}", replace(base, variant=variant)))
+    last = _LADDER[len(cells) - 1 :]
+    cells.append(Cell(f"+ our {' and '.join(last)} = ours", base))
+    text = "From the method as published to ours, one stage after another; each row keeps what those above it changed."
+    return [Section("ladder", "The ladder", text, tuple(cells))]
+
+
+def _factors(base: EvaluateMpc, scale: Scale) -> list[Section]:
+    cells = [Cell("usual world", base)] + [Cell(name, replace(base, factor=name)) for name in scale.factors]
+    text = "One thing differs from what the method takes for granted, and it is not told."
+    return [Section("factors", "Factors of variation", text, tuple(cells))]
+
+
+def _attribution(base: EvaluateMpc, _scale: Scale) -> list[Section]:
+    cells = [Cell("ours", base), Cell("true light", replace(base, variant=Variant("known_light")))]
+    cells += [Cell(f"true {truth}", replace(base, variant=Variant(truths=frozenset({truth})))) for truth in TRUTHS]
+    cells.append(Cell("all true", replace(base, variant=Variant(truths=frozenset(TRUTHS)))))
+    text = "Each stage in turn is replaced by the truth: what its errors cost."
+    return [Section("attribution", "Where episodes fail", text, tuple(cells))]
+
 
 # Measuring the cells of a report side by side, and what their results say next to each other.
 
@@ -85,34 +275,28 @@ def measure_cells(
         [episode_pieces(checked(cell.config, fields, assets), fields, assets) for cell in section.cells]
         for section in sections
     ]
-    unique = {_place(piece): piece for cells in pieces for own in cells for piece in own}
+    # Where a piece is kept is the same for equal pieces of several cells.
+    unique = {(piece.cache.folder, piece.name): piece for cells in pieces for own in cells for piece in own}
     results = yield from finished(list(unique.values()), executor, "episodes")
     found = dict(zip(unique, results, strict=True))
-    return [
-        _measured(section, [[found[_place(piece)] for piece in own] for own in cells])
-        for section, cells in zip(sections, pieces, strict=True)
-    ]
+    measured = []
+    for section, own in zip(sections, pieces, strict=True):
+        first: tuple[EvaluateMpc, MpcReport] | None = None
+        cells = []
+        for (label, config), parts in zip(section.cells, own, strict=True):
+            report = episodes_report(config, [found[piece.cache.folder, piece.name] for piece in parts])
+            against = None
+            if first is not None and _tasks_of(first[0]) == _tasks_of(config):
+                against = paired(report.shipped, first[1].shipped)
+            cells.append(MeasuredCell(label, report, figures_of(config, report), against))
+            first = first or (config, report)
+        measured.append(MeasuredSection(section, tuple(cells)))
+    return measured
 
 
-def _place(piece: Piece) -> tuple[Path, str]:
-    """Return where a piece is kept, which is the same for equal pieces of several cells."""
-    return piece.cache.folder, piece.name
-
-
-def _measured(section: Section, results: Sequence[Sequence[TaskResult]]) -> MeasuredSection:
-    reports = [episodes_report(cell.config, found) for cell, found in zip(section.cells, results, strict=True)]
-    cells = []
-    for number, (cell, report) in enumerate(zip(section.cells, reports, strict=True)):
-        is_comparable = number > 0 and _same_tasks(section.cells[0].config, cell.config)
-        against = paired(report.shipped, reports[0].shipped) if is_comparable else None
-        cells.append(MeasuredCell(cell.label, report, figures_of(cell.config, report), against))
-    return MeasuredSection(section, tuple(cells))
-
-
-def _same_tasks(one: EvaluateMpc, other: EvaluateMpc) -> bool:
-    """Return whether two cells have the same tasks: families differ in them, but for the light of the goal image."""
-    places = {config.family.replace("relit", "shifted") for config in (one, other)}
-    return len(places) == 1 and (one.objects, one.tasks) == (other.objects, other.tasks)
+def _tasks_of(config: EvaluateMpc) -> tuple[str, int, int]:
+    """Return what a cell's tasks depend on: families differ in them, but for the light of the goal image."""
+    return config.family.replace("relit", "shifted"), config.objects, config.tasks
 
 
 # The report as one HTML file that needs nothing beside it.
@@ -179,12 +363,9 @@ def write_page(
 
     template = (files("osfcore.experiments.reproduction") / _TEMPLATE).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
-    given = {"about": about, "warnings": warnings, "findings": findings, "parts": parts, "data_url": _data_url}
+    given = {"about": about, "warnings": warnings, "findings": findings, "parts": parts}
+    given["data_url"] = lambda picture: f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"
     write_atomically(path, environment.from_string(template).render(given).encode())
-
-
-def _data_url(path: Path) -> str:
-    return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 # Charts of a report's sections.
@@ -195,20 +376,8 @@ _SHARE = Axis("share of tasks", 0, 1)
 _DISTANCE = Axis("6D pose distance, symmetries counted", 0, 0.6)
 
 
-def write_success_curves(path: Path, sections: Sequence[MeasuredSection]) -> None:
-    """Draw success against threshold, a panel for each number of objects (paper, figure 7).
-
-    Args:
-        path: of the PNG.
-        sections: one for each number.
-
-    Raises:
-        CannotWrite: if the disk refuses.
-    """
-    write_charts(path, [_success_chart(section) for section in sections])
-
-
 def _success_chart(section: MeasuredSection) -> Chart:
+    """Draw success against threshold, for one number of objects (paper, figure 7)."""
     first = section.cells[0]
     kinds = {cell.label: cell.report.shipped for cell in section.cells} | {"no action": first.report.nothing}
     if first.report.oracle:
@@ -224,21 +393,6 @@ def _curve(name: str, scores: Sequence[RearrangementScore]) -> Curve:
     counts = np.searchsorted(distances, places, side="right")
     band = np.array([share_interval(int(count), len(scores)) for count in counts]).T
     return Curve(name, places, counts / len(scores), band=band)
-
-
-def write_success_bars(path: Path, section: MeasuredSection) -> None:
-    """Draw the share of tasks within 2 cm and 0.1 rad of each cell, with Wilson's intervals.
-
-    Args:
-        path: of the PNG.
-        section: whose cells are shown.
-
-    Raises:
-        CannotWrite: if the disk refuses.
-    """
-    key, axis = "success_tight", Axis("share of tasks within 2 cm and 0.1 rad", 0, 1)
-    bars = [Bar(cell.label, cell.figures[key], *cell.figures[f"{key}_interval"]) for cell in section.cells]
-    write_bars(path, section.section.title, axis, bars)
 
 
 # What a report's sections say in sentences: who is ahead, who is not, and what costs most.
@@ -258,10 +412,20 @@ def findings(sections: Sequence[MeasuredSection]) -> list[str]:
     ]
     corrected = holm([_gap(cell, key)["p"] for _, cell, key in comparisons])
     sentences = [_method(*one, p) for one, p in zip(comparisons, corrected, strict=True)]
-    sentences += [_distance(section.cells[0]) for section in methods]
-    for section in sections:
-        if section.section.name == "factors":
-            sentences += _costly(section)
+    for section in methods:
+        ours = section.cells[0]
+        mean, nothing = (ours.figures[f"{who}pose6d_symmetric_mean"] for who in ("", "noaction_"))
+        sentences.append(
+            f"{_objects(ours)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
+            f"{nothing:.3f}: {'at most' if mean <= _HALF * nothing else 'more than'} half."
+        )
+    for cell in (cell for section in sections if section.section.name == "factors" for cell in section.cells[1:]):
+        lost, low, high = _lead(cell, "success_tight")
+        if -_gap(cell, "success_tight")["difference"] > MOST_LOST:
+            sentences.append(
+                f"Under {cell.label} {lost:.0f} points of success are lost (95 %: {low:.0f} to "
+                f"{high:.0f}), more than {100 * MOST_LOST:.0f}."
+            )
     return sentences
 
 
@@ -287,25 +451,6 @@ def _method(ours: MeasuredCell, other: MeasuredCell, key: str, corrected: float)
         f"{100 * other.figures[key]:.0f} %, which is {lead:+.0f} points (95 %: {low:+.0f} to {high:+.0f}; "
         f"McNemar p = {_gap(other, key)['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
     )
-
-
-def _distance(ours: MeasuredCell) -> str:
-    mean, nothing = (ours.figures[f"{who}pose6d_symmetric_mean"] for who in ("", "noaction_"))
-    verdict = "at most" if mean <= _HALF * nothing else "more than"
-    return (
-        f"{_objects(ours)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
-        f"{nothing:.3f}: {verdict} half."
-    )
-
-
-def _costly(section: MeasuredSection) -> Iterator[str]:
-    for cell in section.cells[1:]:
-        lost, low, high = _lead(cell, "success_tight")
-        if -_gap(cell, "success_tight")["difference"] > MOST_LOST:
-            yield (
-                f"Under {cell.label} {lost:.0f} points of success are lost (95 %: {low:.0f} to "
-                f"{high:.0f}), more than {100 * MOST_LOST:.0f}."
-            )
 
 
 def _objects(cell: MeasuredCell) -> str:
@@ -422,7 +567,6 @@ PAGE_FILE, FIGURES_FILE = "report.html", "reproduction.json"
 _CURVES = "success.png"
 PartName = Literal["relighting", "video"] | SectionName
 PARTS: tuple[PartName, ...] = ("relighting", "video", *SECTIONS)
-_TITLES = {"relighting": "Scenes under any light", "video": "Predicted futures"}
 _IMAGE_PARTS = {"relighting": relighting_part, "video": video_part}
 
 
@@ -472,34 +616,27 @@ def reproduce(config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, exe
     names = common_names(FIELD_METHODS, config.names, fields, assets, config.data_dir, config.scale.objects)
     config = replace(config, about=replace(config.about, names=names))
     images: dict[str, dict[str, Any]] = {}
-    for name, steps in _image_comparisons(config, fields, assets, executor).items():
-        for step in steps:
-            yield EvaluationStep(step.done, step.total, f"{_TITLES[name]}: {step.note}")
+    scale, seed = config.scale, config.about.seed
+    given = {"names": names, "seed": seed, "objects": scale.objects}
+    relit = CompareRelighting(config.folder, config.data_dir, tasks=scale.scenes, **given)
+    videos = CompareVideos(config.folder, config.data_dir, tasks=scale.videos, **given)
+    comparisons: dict[str, tuple[str, Steps]] = {
+        "relighting": ("Scenes under any light", compare_relighting(relit, fields, assets, executor)),
+        "video": ("Predicted futures", compare_videos(videos, fields, assets, executor)),
+    }
+    for name, (title, steps) in comparisons.items():
+        for step in steps if name in config.parts else ():
+            yield EvaluationStep(step.done, step.total, f"{title}: {step.note}")
             images[name] = step.report or {}
-    base = EvaluateMpc(config.folder, config.data_dir, seed=config.about.seed, names=names)
+    base = EvaluateMpc(config.folder, config.data_dir, seed=seed, names=names)
     chosen: tuple[SectionName, ...] = tuple(name for name in SECTIONS if name in config.parts)
-    measured = yield from measure_cells(sections_of(base, config.scale, chosen), fields, assets, executor)
+    measured = yield from measure_cells(sections_of(base, scale, chosen), fields, assets, executor)
     report = _figures(config, images, measured)
     write_json(config.folder / FIGURES_FILE, report)
     parts = [_IMAGE_PARTS[name](config.folder, figures) for name, figures in images.items()]
     parts += _section_parts(config.folder, measured)
     write_page(config.folder / PAGE_FILE, config.about, _warnings(config), report["findings"], parts)
     yield EvaluationStep(1, 1, "The report is written", report)
-
-
-def _image_comparisons(
-    config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None
-) -> dict[str, Steps]:
-    """Return the parts that compare images, not begun."""
-    scale, about = config.scale, config.about
-    given = {"names": about.names, "seed": about.seed, "objects": scale.objects}
-    relit = CompareRelighting(config.folder, config.data_dir, tasks=scale.scenes, **given)
-    videos = CompareVideos(config.folder, config.data_dir, tasks=scale.videos, **given)
-    comparisons = {
-        "relighting": compare_relighting(relit, fields, assets, executor),
-        "video": compare_videos(videos, fields, assets, executor),
-    }
-    return {name: steps for name, steps in comparisons.items() if name in config.parts}
 
 
 def _figures(config: Reproduce, images: Mapping[str, Any], measured: Sequence[MeasuredSection]) -> dict[str, Any]:
@@ -533,11 +670,13 @@ def _section_parts(folder: Path, measured: Sequence[MeasuredSection]) -> list[Pa
     for section in measured:
         about, pictures = section.section, list[tuple[Path, str]]()
         if about.name != "methods":
-            picture = folder / f"{about.name}.png"
-            write_success_bars(picture, section)
+            picture, axis = folder / f"{about.name}.png", Axis("share of tasks within 2 cm and 0.1 rad", 0, 1)
+            figures = {cell.label: cell.figures for cell in section.cells}
+            bars = [Bar(name, f["success_tight"], *f["success_tight_interval"]) for name, f in figures.items()]
+            write_bars(picture, about.title, axis, bars)
             pictures.append((picture, f"{about.title}: share of tasks within 2 cm and 0.1 rad"))
         elif section is methods[0]:  # one picture for all numbers of objects
-            write_success_curves(folder / _CURVES, methods)
+            write_charts(folder / _CURVES, [_success_chart(one) for one in methods])
             pictures.append((folder / _CURVES, "Share of tasks within each 6D distance, for each number of objects"))
         parts.append(PagePart(about.title, about.text, pictures, _HEADS, rows_of(section)))
     return parts

@@ -23,7 +23,7 @@ speed.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
@@ -512,7 +512,6 @@ class FitVidModel(nn.Module):
 
 FORMAT = "fitvid-2"
 _FILE = "fitvid.safetensors"
-_SIZES = ("side", "width", "features", "hidden", "latent")
 
 
 def fitvid_path(data_dir: Path | None) -> Path:
@@ -549,7 +548,7 @@ def read_fitvid(path: Path, precision: torch.dtype = torch.float32) -> FitVidMod
     """
     metadata, values = read_parameters(path, FORMAT, "video prediction network")
     try:
-        settings = FitVidSettings(**{name: int(metadata[name]) for name in _SIZES})
+        settings = FitVidSettings(**{size.name: int(metadata[size.name]) for size in fields(FitVidSettings)})
     except (KeyError, ValueError) as error:
         raise CorruptFile(path, f"it holds no video prediction network of known size ({shown(error)})") from error
     with torch.device("meta"):  # what the file describes may be larger than what it holds

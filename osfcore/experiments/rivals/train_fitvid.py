@@ -62,16 +62,14 @@ def augmented(videos: Float[Tensor, "B T 3 h w"], rng: np.random.Generator) -> F
     Returns:
         Videos of the same size in [0, 1].
     """
-    return torch.stack([_recoloured(_cropped(video, rng), rng).clamp(0, 1) for video in videos])
-
-
-def _cropped(video: Frames, rng: np.random.Generator) -> Frames:
-    """Cut out a square of at least four fifths of the side, and bring it back to the video's size."""
-    full = video.shape[-1]
-    side = int(rng.integers(round(LEAST_CROP * full), full + 1))
-    top, left = rng.integers(full - side + 1, size=2)
-    crop = video[..., top : top + side, left : left + side]
-    return functional.interpolate(crop, (full, full), mode="bilinear", align_corners=False)
+    full, varied = videos.shape[-1], []
+    for video in videos:
+        side = int(rng.integers(round(LEAST_CROP * full), full + 1))
+        top, left = rng.integers(full - side + 1, size=2)
+        crop = video[..., top : top + side, left : left + side]
+        cropped = functional.interpolate(crop, (full, full), mode="bilinear", align_corners=False)
+        varied.append(_recoloured(cropped, rng).clamp(0, 1))
+    return torch.stack(varied)
 
 
 def _recoloured(video: Frames, rng: np.random.Generator) -> Frames:
@@ -397,23 +395,6 @@ def train_fitvid(config: TrainFitVid) -> Iterator[Progress]:
             from.
         CannotWrite: if the output cannot be written, which is tried first.
     """
-    _check(config)
-    device = pick_device(config.device)
-    check_weights_place(config.out, _OWN_METRICS)
-    with VideoFiles(config.data) as videos:
-        run = _Run(config, videos, device)
-        run.resume()
-        yield run.progress("Reading the frames")
-        while run.share < 1:
-            note = run.iterate()
-            if run.steps % config.save_every == 0:
-                run.save()
-            yield run.progress(note)
-        run.save()  # a kill while it measures repeats no step
-        yield from run.finish()
-
-
-def _check(config: TrainFitVid) -> None:
     check_seed(config.seed)
     if config.precision not in ("bfloat16", "float32"):
         raise InvalidInput("precision", repr(config.precision), '"bfloat16" or "float32"')
@@ -428,6 +409,19 @@ def _check(config: TrainFitVid) -> None:
         ("steps between checkpoints", config.save_every, 1, 1_000_000),
         ("held-out videos", config.measured, 1, 1_000_000),
     )
+    device = pick_device(config.device)
+    check_weights_place(config.out, _OWN_METRICS)
+    with VideoFiles(config.data) as videos:
+        run = _Run(config, videos, device)
+        run.resume()
+        yield run.progress("Reading the frames")
+        while run.share < 1:
+            note = run.iterate()
+            if run.steps % config.save_every == 0:
+                run.save()
+            yield run.progress(note)
+        run.save()  # a kill while it measures repeats no step
+        yield from run.finish()
 
 
 class _Run:
@@ -467,7 +461,13 @@ class _Run:
         latents = torch.Generator(self._device).manual_seed(int(rng.integers(2**62)))
         actions = torch.as_tensor(window.actions, device=self._device)
         losses = self._model.losses(frames, actions, latents)
-        self._descend(losses.squared_error + config.beta * losses.kl)
+        self._adam.zero_grad(set_to_none=True)
+        (losses.squared_error + config.beta * losses.kl).backward()
+        norm = torch.nn.utils.clip_grad_norm_(self._model.parameters(), _CLIP)
+        for group in self._adam.param_groups:
+            group["lr"] = config.rate * min(1.0, max((1 - self.share) / _FALLING, 1e-3))
+        if torch.isfinite(norm):  # else this step would spoil all that follow
+            self._adam.step()
         error, kl = (float(loss.detach()) / (config.frames - 1) for loss in losses)
         still = float((frames[:, CONTEXT:] - frames[:, CONTEXT - 1 : CONTEXT]).square().mean())
         for name, value in {"error": error, "kl": kl, "still": still}.items():
@@ -476,15 +476,6 @@ class _Run:
         self._spent_s += time.monotonic() - began
         error, still, kl = (self._recent[name] for name in ("error", "still", "kl"))
         return f"step {self.steps}: MSE {error:.5f}, of a copied frame {still:.5f}; KL {kl:.2f}"
-
-    def _descend(self, loss: torch.Tensor) -> None:
-        self._adam.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self._model.parameters(), _CLIP)
-        for group in self._adam.param_groups:
-            group["lr"] = self._config.rate * min(1.0, max((1 - self.share) / _FALLING, 1e-3))
-        if torch.isfinite(norm):  # else this step would spoil all that follow
-            self._adam.step()
 
     @property
     def _checkpoint(self) -> Path:

@@ -18,23 +18,32 @@ from osfcore.experiments.estimation import (
     VIEWS,
     EstimateReport,
     EvaluateEstimate,
+    FrameScore,
     TaskRunner,
+    TrackScore,
     bad_failure,
+    coverage,
     drift,
     evaluate_estimate,
+    flags,
     frame_failure,
+    lost_at,
+    pose_errors,
+    ratios_of,
+    refused_frame,
+    score_frame,
     state_of,
     track_failure,
     write_gallery,
     write_plots,
 )
-from osfcore.experiments.estimation_scores import FrameScore, TrackScore, refused_frame
 from osfcore.experiments.estimation_tasks import KINDS, BadScore
 from osfcore.experiments.harness import results_of
-from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.poses import rotate
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.inspection.contact_sheet import Comparison
-from osfcore.io.json_codec import decode
+from osfcore.io.json_codec import decode, encode
 from osfcore.objects.asset_library import AssetLibrary
 from tests.support.errors import about
 from tests.support.estimate_scores import frame, report, score, track
@@ -125,7 +134,7 @@ def test_what_was_measured_is_taken_over_unless_circumstances_changed(evaluated,
     assert fewer.tracks is fewer.views is fewer.fixed_light is fewer.bad is None
     assert not oracle.asked
     effort = replace(EFFORT, generations=2)
-    for change in ({"tasks": 3}, {"seed": 1}, {"objects": 1}, {"size": 48}, {"effort": effort}):
+    for change in ({"tasks": 3}, {"seed": 1}, {"size": 48}, {"effort": effort}):
         before = len(oracle.asked)
         last(evaluate_estimate(replace(config, parts=("first",), **change), solids, library))
         assert len(oracle.asked) - before == (1 if "tasks" in change else 2)
@@ -207,7 +216,12 @@ def test_the_real_estimators_are_called_as_they_want_to_be(solids, library, tmp_
 
 
 @pytest.mark.slow
-def test_tracks_and_goals_begin_with_estimates_and_never_with_the_truth(runner, oracle):
+def test_parts_see_what_they_should_and_begin_with_estimates_never_with_the_truth(runner, oracle):
+    done(runner.fixed_light(0))
+    for cameras in VIEWS.values():
+        done(runner.first(0, cameras))
+    assert [what for what, _ in oracle.asked] == ["first held 4", "first search 1", "first search 2"]
+    oracle.asked.clear()
     first = done(runner.first(0))
     start = state_of(first)
     track = decode(TrackScore, done(runner.track(0, first)).figures["score"], "score")
@@ -228,18 +242,10 @@ def test_tracks_and_goals_begin_with_estimates_and_never_with_the_truth(runner, 
     assert len(oracle.asked) == asked + 2
 
 
-def test_ablations_see_fewer_cameras_or_hold_the_light(runner, oracle):
-    done(runner.fixed_light(0))
-    for cameras in VIEWS.values():
-        done(runner.first(0, cameras))
-    assert [what for what, _ in oracle.asked] == ["first held 4", "first search 1", "first search 2"]
-    one, other = (default_cameras()[n] for n in VIEWS[2])
-    forward = [rotate(camera.T_world_camera.quaternion, np.array([0, 0, 1.0])) for camera in (one, other)]
-    assert forward[0][:2] @ forward[1][:2] < 0  # they face each other
-
-
 @pytest.mark.slow
 def test_bad_cases_are_judged_by_what_is_there(runner, oracle):
+    oracle.refuses = 1
+    assert decode(BadScore, done(runner.bad(len(KINDS))).figures["score"], "score").refused
     scores = {kind: decode(BadScore, done(runner.bad(n)).figures["score"], "score") for n, kind in enumerate(KINDS)}
     assert [scores[kind].kind for kind in KINDS] == list(KINDS)
     assert not scores["wrong name"].is_right
@@ -248,13 +254,6 @@ def test_bad_cases_are_judged_by_what_is_there(runner, oracle):
     assert scores["goal of other objects"].is_confidently_wrong
     assert scores["swapped masks"].is_right  # the oracle sees through it
     assert [what for what, _ in oracle.asked].count("goal") == 2
-
-
-def test_a_refused_bad_case_is_not_confidently_wrong(runner, oracle):
-    oracle.refuses = 1
-    score = decode(BadScore, done(runner.bad(0)).figures["score"], "score")
-    assert score.refused
-    assert not score.is_confidently_wrong
 
 
 # Report
@@ -358,3 +357,113 @@ def test_a_gallery_shows_the_worst_and_goes_when_nothing_fails(shown, tmp_path):
     assert cv2.imread(str(path)).shape == (MOST_SHOWN * one[0], one[1], 3)
     write_gallery(path, [None])
     assert not path.exists()
+
+
+# Scores
+
+
+BOX, CAN = NAMES = ("003_cracker_box", "005_tomato_soup_can")
+
+
+@pytest.fixture(scope="module")
+def assets(library):
+    return {name: library.load(name) for name in NAMES}
+
+
+@pytest.fixture
+def truth():
+    rng = np.random.default_rng(1)
+    poses = Pose(rng.normal(0, 0.1, (2, 3)), quaternion_exp(rng.normal(size=(2, 3))))
+    return SceneState(NAMES, poses, Light([0.3, 0.1, 0.9]), None)
+
+
+def believed(truth, shift=(0, 0, 0), turn=(0, 0, 0), *, doubts=("", ""), reason="", std=0.001, light=None):
+    """The truth, the first object shifted [m] and turned [rad]."""
+    position, quaternion = truth.poses.position.copy(), truth.poses.quaternion.copy()
+    position[0] += shift
+    quaternion[0] = quaternion_multiply(quaternion_exp(np.array(turn, float)), quaternion[0])
+    state = replace(truth, poses=Pose(position, quaternion), light=light or truth.light)
+    return EstimatedState(state, np.full(2, std), np.full(2, std), 0.01, doubts, reason)
+
+
+def test_errors_are_what_was_done_to_the_truth(truth, assets):
+    estimate = believed(truth, (0.003, 0, -0.004), (0, 0.06, 0))
+    found = score_frame(estimate, truth, assets, 3.0)
+    first, second = found.objects
+    assert first.position_mm == pytest.approx(5)
+    assert first.rotation_deg == pytest.approx(np.rad2deg(0.06))
+    np.testing.assert_allclose(first.position_ratios, [3, 0, 4], atol=1e-9)
+    np.testing.assert_allclose(first.rotation_ratios, [0, 60, 0], atol=1e-6)
+    assert 0 < first.adds_mm < 15
+    assert second.position_mm == second.adds_mm == 0
+    assert second.rotation_deg == pytest.approx(0, abs=1e-6)
+    assert found.light_deg == pytest.approx(0, abs=1e-6)
+    assert (found.seconds, found.trusted, found.is_right) == (3.0, True, True)
+    shift, turn = pose_errors(estimate.state, truth, assets)
+    np.testing.assert_allclose(shift, [5, 0], atol=1e-12)
+    np.testing.assert_allclose(turn, [np.rad2deg(0.06), 0], atol=1e-6)
+
+
+def test_the_order_of_objects_plays_no_part(truth, assets):
+    estimate = believed(truth, (0.02, 0, 0))
+    swapped = replace(estimate.state, names=NAMES[::-1], poses=estimate.state.poses[::-1])
+    found = score_frame(replace(estimate, state=swapped), truth, assets, 0.0, ("", "out of view"))
+    assert [(o.name, round(o.position_mm), o.absent) for o in found.objects] == [(CAN, 0, "out of view"), (BOX, 20, "")]
+
+
+def test_light_errors_are_angles_across_the_true_direction(truth, assets):
+    turned = Light(truth.light.direction + 0.02 * np.cross(truth.light.direction, [0, 0, 1.0]))
+    found = score_frame(believed(truth, light=turned), truth, assets, 0.0)
+    assert found.light_deg == pytest.approx(np.rad2deg(0.02 * np.hypot(*truth.light.direction[:2])), rel=1e-3)
+    assert np.hypot(*found.light_ratios) == pytest.approx(np.deg2rad(found.light_deg) / 0.01)
+    held = score_frame(replace(believed(truth), light_std=0.0), truth, assets, 0.0)
+    assert held.light_ratios == ()
+
+
+def test_boundless_and_vanishing_deviations_stay_plain_numbers(truth, assets):
+    for std in (0.0, np.inf):
+        found = score_frame(believed(truth, (0.003, 0, 0), std=std), truth, assets, 0.0)
+        json.dumps(encode(found), allow_nan=False)
+        assert found.objects[0].position_ratios[0] == (0 if std else 1e6)
+
+
+def test_coverage_looks_at_right_estimates_only():
+    frames = [
+        frame(score(ratios=(0.5, 1.0, 3.0)), light=(9.0, 9.0)),
+        frame(score(position_mm=50, ratios=(99.0,) * 3), light=(99.0, 99.0)),
+    ]
+    found = ratios_of(frames)
+    assert found == ((0.5, 1.0, 3.0), (0.5, 1.0, 3.0), (9.0, 9.0))
+    assert coverage(found.position) == pytest.approx(2 / 3)
+    assert coverage(()) is None
+    errors = np.abs(np.random.default_rng(0).normal(size=20_000))
+    assert coverage(errors) == pytest.approx(0.9545, abs=0.008)
+
+
+def test_a_doubt_about_the_whole_flags_all_objects(truth):
+    assert flags(believed(truth)) == (False, False)
+    assert flags(believed(truth, doubts=("why", ""), reason="why")) == (True, False)
+    assert flags(believed(truth, reason="too dark")) == (True, True)  # a doubt about the whole
+
+
+@pytest.mark.parametrize(
+    ("position", "rotation", "absent", "expected"),
+    [
+        ([0, 40, 0, 40, 0], [0] * 5, [""] * 5, None),
+        ([0, 31, 31, 0, 0], [0] * 5, [""] * 5, 2),
+        ([30] * 5, [20] * 5, [""] * 5, None),  # not over
+        ([0, 40, 0, 0, 0], [0, 0, 21, 0, 0], [""] * 5, 2),  # one way or the other
+        ([0, 0, 0, 0, 40], [0] * 5, [""] * 5, None),  # once only
+        ([40] * 5, [0] * 5, ["off the table"] * 5, None),
+        ([40] * 5, [0] * 5, ["", "out of view", "", "", ""], 3),
+    ],
+)
+def test_a_track_is_lost_when_it_is_far_off_for_two_steps_running(position, rotation, absent, expected):
+    assert lost_at(position, rotation, absent) == expected
+
+
+def test_each_object_is_lost_by_itself():
+    assert track([0.0, 40.0, 0.0], [0.0, 0.0, 40.0]).lost_at == (None, None)  # never the same one twice
+    assert track([0.0, 40.0, 40.0], [0.0, 0.0, 40.0]).lost_at == (2, None)
+    nothing = replace(track([0.0]), position_mm=(), rotation_deg=(), absent=(), refused="no start")
+    assert nothing.lost_at == (0,)

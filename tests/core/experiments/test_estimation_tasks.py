@@ -1,4 +1,3 @@
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,19 +9,16 @@ from osfcore.experiments.estimation_tasks import (
     FIRST_SCENE,
     KINDS,
     WARM_SCENE,
-    BadScore,
     bad_case,
     episode,
     first_frame,
     goals,
-    summary,
     take_frame,
     warm_models,
 )
 from osfcore.experiments.harness import MAX_TASKS
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
-from osfcore.io.json_codec import decode, encode
 from osfcore.world.tabletop import Tabletop
 from osfcore.world.tasks import draw_scene, opened
 from tests.support.oracle import Oracle
@@ -188,21 +184,6 @@ def test_the_same_number_is_the_same_case(cases, library):
     later = bad_case(SOLIDS, 2, 4, 5 + len(KINDS), library, 48)
     assert later.kind == again.kind
     assert (later.observation.images != again.observation.images).any()
-
-
-def test_cases_are_refused_or_flagged_or_believed():
-    scores = [
-        BadScore(KINDS[0], "no masks", "", False),
-        BadScore(KINDS[0], "", "it is hardly visible", False),
-        BadScore(KINDS[0], "", "", False, (50.0,), (3.0,)),
-        BadScore(KINDS[1], "", "", True),
-        BadScore(KINDS[1], "", "it is hardly visible", True),
-    ]
-    found = summary(scores)
-    assert (found["bad_cases"], found["bad_refused"], found["bad_flagged"]) == (5, 1, 2)
-    assert (found["bad_right"], found["bad_confident_wrong"]) == (2, 1)
-    assert {kind: row["confident_wrong"] for kind, row in found["bad_by_kind"].items()} == {KINDS[0]: 1, KINDS[1]: 0}
-    assert [decode(BadScore, json.loads(json.dumps(encode(score))), "score") for score in scores] == scores
 
 
 # Warm-up

@@ -71,35 +71,22 @@ def test_pieces_are_done_once_even_if_the_evaluation_is_left(tmp_path, executor)
     assert numbers(last(results_of(pieces(tmp_path), executor))) == [0, 1, 2, 3]
     assert [numbers(results) for results in results_of(pieces(tmp_path))] == [[0, 1, 2, 3]]
     assert numbers(next(results_of(pieces(tmp_path, circumstances={"seed": 1})))) == [None] * 4
-
-
-def test_torch_has_one_thread_meanwhile(tmp_path):
     before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        assert numbers(last(results_of(pieces(tmp_path, 1, threads)))) == [1]
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
+    (result,) = last(results_of(pieces(tmp_path, 1, threads, {"seed": 2}), executor))
+    assert (result.figures["number"], torch.get_num_threads()) == (1, before)
 
 
 @pytest.mark.slow
 def test_processes_do_them_and_the_results_are_kept_here(tmp_path):
+    deadly_one = Piece("99", TaskCache(tmp_path), {}, partial(deadly, 9))
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
         results = last(results_of(pieces(tmp_path), executor))
+        with pytest.raises(WorkerDied):  # what was done is not lost
+            last(results_of([*pieces(tmp_path), deadly_one], executor))
     assert numbers(results) == [0, 1, 2, 3]
     made_by = [result.figures["process"] for result in results]
     assert os.getpid() not in made_by
     assert [result.figures["process"] for result in last(results_of(pieces(tmp_path)))] == made_by
-
-
-@pytest.mark.slow
-def test_a_worker_that_dies_costs_nothing_that_was_done(tmp_path):
-    begun = pieces(tmp_path, 2)
-    last(results_of(begun))
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor, pytest.raises(WorkerDied):
-        last(results_of([*begun, Piece("99", TaskCache(tmp_path), {}, partial(deadly, 9))], executor))
-    assert numbers(last(results_of(begun))) == [0, 1]
 
 
 @pytest.fixture

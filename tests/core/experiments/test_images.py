@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 
+from osfcore.errors import InvalidInput, MissingAssets, UnknownName
 from osfcore.experiments.charts import Axis
-from osfcore.experiments.harness import Piece, TaskCache, TaskResult
-from osfcore.experiments.images import chart_of, measured, summary, tables_of
-from osfcore.inspection.contact_sheet import Comparison
+from osfcore.experiments.images import FIELD_METHODS, chart_of, common_names, field_path, summary
+from osfcore.fields.field_library import FieldLibrary
+from tests.support.errors import about
+from tests.support.solids import SOLIDS, write_nerfs
 
 NONE = float("nan")
 OURS, THEIRS = np.array([[4.0, 6.0], [8.0, 10.0], [0.0, 2.0]]), np.array([[1.0, 3.0], [5.0, 7.0], [-3.0, -1.0]])
@@ -47,18 +49,30 @@ def test_a_chart_begins_below_the_lowest_mean():
     assert empty.y.low == 0
 
 
-def test_results_are_sorted_by_method(tmp_path):
-    def piece(method, number):
-        black = np.zeros((16, 16, 3), np.uint8)
-        result = TaskResult({"psnr": [number, None]}, (Comparison("", black, black),))
-        return Piece(f"{number}", TaskCache(tmp_path / method), {}, lambda: result)
+# Methods
 
-    results = {}
 
-    def steps():
-        results.update((yield from measured({"ours": [piece("ours", 3)], "paper": [piece("paper", 5)]}, None)))
+def test_all_methods_know_the_objects_that_are_drawn(library, tmp_path):
+    write_nerfs(tmp_path)
+    fields = FieldLibrary(None)
+    for methods in (("ours",), ("nerf", "paper", "ours")):
+        names = common_names(methods, None, fields, library, tmp_path, 3)
+        assert set(SOLIDS) <= set(names) <= set(library.names())
+        assert all(field_path(method, name, fields, tmp_path).is_file() for name in names for method in methods)
+    again = (SOLIDS[1], SOLIDS[0], SOLIDS[1])
+    assert common_names(FIELD_METHODS, again, fields, library, tmp_path, 2) == again[:2]
 
-    assert [(step.done, step.total, step.report) for step in steps()] == [(0, 2, None), (1, 2, None)]
-    tables = tables_of(results, ("psnr",))
-    np.testing.assert_array_equal(tables["ours"]["psnr"], [[3, NONE]])
-    np.testing.assert_array_equal(tables["paper"]["psnr"], [[5, NONE]])
+
+@pytest.mark.parametrize(
+    ("methods", "names", "count", "error", "what"),
+    [
+        (("ours",), ("teapot",), 1, UnknownName, "teapot"),
+        (("paper",), ("011_banana",), 1, UnknownName, "011_banana"),
+        (("ours",), ("011_banana",), 1, MissingAssets, "011_banana"),
+        (("ours",), None, 9, InvalidInput, "objects in a scene"),
+        (("ours",), SOLIDS[:2], 3, InvalidInput, "number of objects"),
+    ],
+)
+def test_what_some_method_cannot_show_is_refused(library, tmp_path, methods, names, count, error, what):
+    with pytest.raises(error, check=about(what)):
+        common_names(methods, names, FieldLibrary(None), library, tmp_path, count)

@@ -15,7 +15,6 @@ from osfcore.experiments.pusht import (
     Problem,
     PushT,
     PushTEpisode,
-    PytorchMPPI,
     Simulation,
     bench_planner,
     cost_of,
@@ -27,7 +26,6 @@ from osfcore.experiments.pusht import (
     scene_of,
     tee_shape,
 )
-from osfcore.extras import MissingExtra
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_CENTRE_Z_M, STEP_S
 from tests.support.errors import about
 
@@ -90,16 +88,6 @@ def test_the_pusher_keeps_its_velocity(step):
     after = step(moving, velocity)
     np.testing.assert_allclose((after - moving)[0, :2], STEP_S * velocity[0] / PX_M, rtol=0.01)
     np.testing.assert_array_equal(after[0, 4:], APART[4:])
-
-
-def test_a_push_moves_the_tee_along(step):
-    before = BESIDE[None]
-    for _ in range(3):
-        after = step(before, np.array([[0.2, 0.0]]))
-        assert after[0, 4] > before[0, 4]
-        before = after
-    assert before[0, 4] > BESIDE[4] + 50
-    assert before[0, 0] < before[0, 4]  # it stays behind
 
 
 def test_futures_depend_on_states_alone(step):
@@ -169,11 +157,11 @@ def bulldozed(states, velocities):
     return after
 
 
-def planner(name, step=bulldozed, samples=48, horizon=6, seed=0):
+def planner(name, step):
     if name == "pytorch_mppi":
         pytest.importorskip("pytorch_mppi")
-        torch.manual_seed(seed)
-    return PLANNERS[name](Problem(goal_of(GOAL), step, samples, horizon), np.random.default_rng(seed))
+        torch.manual_seed(0)
+    return PLANNERS[name](Problem(goal_of(GOAL), step, 48, 6), np.random.default_rng(0))
 
 
 @pytest.fixture(autouse=True)
@@ -183,18 +171,7 @@ def _torch_is_left_as_it_was():
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_each_brings_the_tee_closer(name):
-    one, state = planner(name), START
-    for _ in range(8):
-        velocity = one.plan(state)
-        assert velocity.shape == (2,)
-        assert np.abs(velocity).max() <= MAX_SPEED_M_S
-        state = bulldozed(state[None], velocity[None])[0]
-    assert np.linalg.norm(state[4:6] - GOAL[:2]) < 0.6 * np.linalg.norm(START[4:6] - GOAL[:2])
-
-
-@pytest.mark.parametrize("name", PLANNERS)
-def test_no_plan_looks_at_more_than_its_budget(name):
+def test_each_brings_the_tee_closer_within_its_budget(name):
     calls = []
 
     def counted(states, velocities):
@@ -202,22 +179,16 @@ def test_no_plan_looks_at_more_than_its_budget(name):
         assert np.abs(velocities).max() <= MAX_SPEED_M_S
         return bulldozed(states, velocities)
 
-    planner(name, counted, samples=40, horizon=5).plan(START)
-    assert 0.9 * 40 * 5 < sum(calls) <= 40 * 5
-
-
-@pytest.mark.parametrize(
-    ("package", "make"),
-    [
-        ("gym_pusht", PushT),
-        ("gym_pusht", Simulation),
-        ("pytorch_mppi", lambda: PytorchMPPI(Problem(goal_of(GOAL), bulldozed, 16, 3), np.random.default_rng(0))),
-    ],
-)
-def test_what_is_not_installed_is_said(monkeypatch, package, make):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(MissingExtra):
-        make()
+    plan, state, seen = planner(name, counted), START, []
+    for _ in range(8):
+        calls.clear()
+        velocity = plan(state)
+        seen.append(sum(calls))
+        assert velocity.shape == (2,)
+        assert np.abs(velocity).max() <= MAX_SPEED_M_S
+        state = bulldozed(state[None], velocity[None])[0]
+    assert 0.9 * 48 * 6 < seen[0] <= max(seen) <= 48 * 6
+    assert np.linalg.norm(state[4:6] - GOAL[:2]) < 0.6 * np.linalg.norm(START[4:6] - GOAL[:2])
 
 
 # Report

@@ -1,7 +1,7 @@
 import json
-from concurrent.futures import Future
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -9,11 +9,23 @@ import osfcore.experiments.rearrangement as measured
 from osfcore.control.estimators import load_scene_models
 from osfcore.control.events import EpisodeSettings, Finished
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
-from osfcore.experiments.rearrangement import REPORT_FILE, Course, EvaluateMpc, evaluate_mpc, prediction_errors
+from osfcore.experiments.harness import TaskResult
+from osfcore.experiments.rearrangement import (
+    CURVE_MM,
+    REPORT_FILE,
+    Course,
+    EvaluateMpc,
+    MpcReport,
+    evaluate_mpc,
+    prediction_errors,
+    write_pictures,
+)
 from osfcore.experiments.rearrangement_runs import METHODS, Ended, Variant
 from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, write_fitvid
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose
+from osfcore.inspection.contact_sheet import Comparison
+from osfcore.metrics.success import ObjectScore, RearrangementScore
 from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.planning.mppi import PlanSettings
 from osfcore.world.scenes import SceneRequest
@@ -100,25 +112,13 @@ def test_the_plan_is_that_of_whoever_plans(library, tmp_path, runs):
         assert report["cost"] == ("image" if is_published else "pose")
 
 
-def test_a_killed_evaluation_goes_on(library, tmp_path, runs):
-    asked = config(tmp_path, tasks=3, oracle=False)
-    for step in evaluate_mpc(asked, FieldLibrary(None), library):
-        if step.done == 2:
-            break
-    assert len(runs) == 2
-    report_of(asked, library)
-    assert [number for _, number, _ in runs] == [0, 1, 2]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "made"),
     [
         ({}, 0),
         ({"tasks": 2}, 1),
-        ({"actions": 3}, 1),
         ({"settings": EpisodeSettings(plan=PlanSettings(samples=9, horizon=4))}, 1),
-        ({"seed": 1}, 1),
         ({"family": "relit"}, 1),
         ({"names": (NAME, "009_gelatin_box")}, 1),
     ],
@@ -181,35 +181,14 @@ def test_visual_foresight_pushes_until_all_actions_are_done(library, tmp_path, r
     assert report["first_mm_median"] is report["own_pushes_mean_mm_4"] is None
 
 
-def test_an_executor_gets_all_episodes_and_changes_no_figure(library, tmp_path, runs):
-    class Elsewhere:
-        given = 0
-
-        def submit(self, work, *arguments):
-            self.given += 1
-            future = Future()
-            future.set_result(work(*arguments))
-            return future
-
-    elsewhere = Elsewhere()
-    plain = report_of(config(tmp_path / "a", tasks=2), library)
-    sent = report_of(config(tmp_path / "b", tasks=2), library, elsewhere)
-    assert {**sent, "episode_s_median": 0} == {**plain, "episode_s_median": 0}
-    assert elsewhere.given == 4
-
-
 @pytest.mark.parametrize(
     ("changes", "error", "subject"),
     [
         ({"tasks": 0}, InvalidInput, "tasks"),
-        ({"objects": 7}, InvalidInput, "objects in a scene"),
-        ({"family": "crowded"}, InvalidInput, "objects"),
-        ({"family": "sorted"}, InvalidInput, "family"),
         ({"seed": -1}, InvalidInput, "seed"),
         ({"variant": Variant("magic")}, InvalidInput, "method"),
         ({"actions": 0}, InvalidInput, "steps"),
         ({"factor": "objects_unseen", "variant": Variant("paper")}, InvalidInput, "factor"),
-        ({"objects": 2, "names": (NAME, NAME)}, InvalidInput, "number of objects"),
         ({"names": ("teapot",)}, UnknownName, "teapot"),
         ({"names": ("011_banana",)}, MissingAssets, "011_banana"),
     ],
@@ -268,3 +247,115 @@ def test_an_estimate_that_is_off_shows_in_the_error(library, models):
     assert off[0] > 290 > exact[0]
     del course.actions[2]  # a start counts if four actions follow
     assert prediction_errors(course, models) == {"mm": [], "deg": []}
+
+
+# Report
+
+
+NAMES = ("004_sugar_box", "006_mustard_bottle", "025_mug")
+
+
+def score(moved, mm, deg, others) -> RearrangementScore:
+    """Of a task with one object more than had to move."""
+    ends = [ObjectScore(name, True, mm, deg, mm / 1000, mm / 2000) for name in NAMES[:moved]]
+    return RearrangementScore((*ends, ObjectScore("061_foam_brick", False, others, 0.0, mm / 1000, mm / 2000)))
+
+
+def ended(moved=1, mm=5.0, deg=3.0, *, others=0.0, **figures) -> TaskResult:
+    """A task that ended so far off, 100 mm at first."""
+    plain = {"plan_s": 1.0, "estimate_s": 0.5, "first_s": 8.0, "goal_s": 20.0, "episode_s": 60.0, "steps": 30}
+    found = {
+        "score": score(moved, mm, deg, others).to_json(),
+        "noaction": score(moved, 100.0, 0.0, 0.0).to_json(),
+        "goal_doubt": "",
+        "goal_mm": 2.0,
+        "first_mm": 0.5,
+        "first_deg": 0.4,
+        "light_deg": 1.5,
+        "robot_s": 6.0,
+        "rejected": {},
+        "predicted": {"mm": [3.0, 4.0], "deg": [1.0, 2.0]},
+    }
+    images = (np.full((16, 16, 3), shade, np.uint8) for shade in (40, 200))
+    return TaskResult(found | plain | figures, (Comparison("0", *images),))
+
+
+OURS = (ended(), ended(2, 15.0, 20.0), ended(3, 40.0, 1.0), ended(1, 10.0, 1.0, others=30.0))
+ORACLE = (
+    ended(mm=1.0, tries=1), ended(2, mm=3.0, tries=3), ended(3, mm=1.0, deg=90.0, tries=4), ended(mm=50.0, tries=4)
+)  # fmt: skip
+
+
+def test_figures_are_means_and_medians_over_tasks():
+    found = MpcReport(OURS, ORACLE).to_json()
+    assert found == json.loads(json.dumps(found, allow_nan=False))
+    assert found["tasks"] == 4
+    assert found["success_2cm"] == 0.5  # one is too far away, one pushed something else
+    assert found["success_tight"] == found["success_2cm_15deg"] == 0.25
+    assert found["success_by_moved"] == {"1": 0.5, "2": 1.0, "3": 0.0}
+    assert found["success_tight_by_moved"] == {"1": 0.5, "2": 0.0, "3": 0.0}
+    assert (found["final_mm_mean"], found["final_mm_median"]) == (17.5, 12.5)
+    assert found["final_deg_median"] == 2.0
+    assert (found["pose6d_mean"], found["pose6d_symmetric_mean"]) == (0.0175, pytest.approx(0.0175 / 2, abs=1e-4))
+    assert (found["replan_s_median"], found["episode_s_median"]) == (1.0, 60.0)
+    assert (found["first_mm_median"], found["first_deg_median"], found["light_deg_median"]) == (0.5, 0.4, 1.5)
+    assert (found["oracle_success_2cm"], found["oracle_success_tight"]) == (0.75, 0.5)
+    assert found["oracle_success_tight_by_try"] == [0.25, 0.25, 0.5, 0.5]
+    assert found["oracle_final_mm_mean"] == 13.75
+    assert (found["noaction_success_2cm"], found["start_mm_mean"]) == (0.0, 100.0)
+    assert (found["own_pushes"], found["own_pushes_mean_mm_4"], found["own_pushes_median_deg_4"]) == (8, 3.5, 1.5)
+    low, high = found["success_2cm_interval"]
+    assert 0 < low < 0.5 < high < 1
+
+
+def test_methods_are_compared_task_by_task_and_without_an_oracle_it_has_no_figures():
+    found, without = (MpcReport(OURS, oracle).to_json() for oracle in (ORACLE, ()))
+    assert set(found) == set(without)
+    assert {without[key] for key in found if key.startswith("oracle_") or key == "against_oracle"} == {None}
+    against = found["against_noaction"]["success_2cm"]
+    assert (against["difference"], against["p"]) == (0.5, 0.5)  # two tasks of two that differ
+    assert found["against_noaction"]["pose6d"]["difference"] == pytest.approx(0.0175 - 0.1)
+    assert found["against_oracle"]["success_2cm"]["difference"] == pytest.approx(-0.25)
+
+
+def test_objects_that_had_to_move_have_rows_of_their_own():
+    rows = MpcReport(OURS, ()).to_json()["by_object"]
+    assert {name: row["moved"] for name, row in rows.items()} == dict(zip(NAMES, (4, 2, 1), strict=True))
+    assert rows[NAMES[0]]["within_2cm"] == 0.75
+    assert rows[NAMES[0]]["tight"] == 0.5
+    assert rows[NAMES[0]]["mm_median"] == 12.5
+
+
+def test_a_refused_goal_is_a_failure_and_the_overruled_figure_stands_beside_it():
+    found = MpcReport((ended(), ended(goal_doubt="009_gelatin_box: hidden")), ()).to_json()
+    assert (found["success_tight"], found["success_tight_overruled"], found["refused"]) == (0.5, 1.0, 1)
+    assert found["final_mm_mean"] == 52.5
+    assert found["seconds_robot_median"] == 6.0
+
+
+def test_more_succeed_the_farther_off_they_may_be():
+    found = MpcReport(OURS, ()).to_json()
+    curve = [found["success_curve"][str(mm)] for mm in CURVE_MM]
+    assert curve == sorted(curve)
+    assert found["success_curve"]["20"] == found["success_2cm"]
+    assert curve[-1] == 0.75  # what was pushed away stays so
+
+
+def test_what_never_happened_has_no_median():
+    rejected = {"no room": 1, "not at rest": 4}
+    refused = ended(plan_s=None, estimate_s=None, goal_doubt="009_gelatin_box: hidden", rejected=rejected)
+    found = MpcReport((refused,), ()).to_json()
+    assert found["replan_s_median"] is found["estimate_s_median"] is found["seconds_robot_median"] is None
+    found = MpcReport((refused, ended(plan_s=3.0, rejected={"no room": 2})), ()).to_json()
+    assert found["replan_s_median"] == 3.0
+    assert found["rejected_layouts"] == {"no room": 3, "not at rest": 4}
+
+
+def test_pictures_show_tasks_and_the_oracle_has_its_own_curve(tmp_path):
+    charts = []
+    for name, oracle in (("with", ORACLE), ("without", ())):
+        write_pictures(tmp_path / name, MpcReport(OURS, oracle))
+        charts.append((tmp_path / name / "mpc.png").read_bytes())
+        sheet = cv2.imread(str(tmp_path / name / "mpc_tasks.png"))
+        assert {40, 200} <= set(np.unique(sheet))  # goals and what was reached
+    assert charts[0] != charts[1]

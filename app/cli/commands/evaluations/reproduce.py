@@ -17,7 +17,7 @@ from app.storage.paths import default_data_dir
 from osfcore.extras import need
 
 if TYPE_CHECKING:
-    from osfcore.experiments.reproduction.sections import Scale
+    from osfcore.experiments.reproduction.reproduction import Scale
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,15 @@ class ReproduceCommand:
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds all figures of the report."""
-        from osfcore.experiments.reproduction.reproduction import PAGE_FILE, PARTS, About, Reproduce, reproduce
-        from osfcore.experiments.reproduction.sections import QUICK, Scale
+        from osfcore.experiments.reproduction.reproduction import (
+            PAGE_FILE,
+            PARTS,
+            QUICK,
+            About,
+            Reproduce,
+            Scale,
+            reproduce,
+        )
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.objects.asset_library import AssetLibrary
 

@@ -37,9 +37,12 @@ def config(data, folder, **changes) -> TrainFitVid:
     return TrainFitVid((data,), folder / "net.safetensors", **{**settings, **changes})
 
 
-def assert_same_weights(a, b) -> None:
-    a, b = load(a.read_bytes()), load(b.read_bytes())
-    assert all(torch.equal(a[name], b[name]) for name in a)
+def stop(settings, done) -> None:
+    """Begin a training and leave it after so many steps."""
+    begun = train_fitvid(settings)
+    while next(begun).done < done:
+        pass
+    begun.close()
 
 
 def test_a_run_writes_a_network_and_its_metrics(data, tmp_path):
@@ -66,36 +69,21 @@ def test_the_command_names_what_differs_from_the_defaults(data, tmp_path):
 def test_an_abandoned_run_goes_on_and_ends_as_a_whole_one(data, tmp_path):
     whole, parts = (config(data, tmp_path / name, measured=1) for name in ("whole", "parts"))
     list(train_fitvid(whole))
-    begun = train_fitvid(parts)
-    while next(begun).done < 2:
-        pass
-    begun.close()
+    stop(replace(parts, iterations=2), 1)  # the budget may grow
     assert not parts.out.exists()
-    assert [s.done for s in train_fitvid(parts)][:2] == [2, 3]
-    assert_same_weights(whole.out, parts.out)
+    assert [s.done for s in train_fitvid(parts)][:3] == [1, 2, 3]
+    a, b = (load(one.out.read_bytes()) for one in (whole, parts))
+    assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 @pytest.mark.parametrize("damage", ["other settings", "cut short"])
 def test_a_checkpoint_that_does_not_fit_is_not_gone_on_with(data, tmp_path, damage):
     settings = config(data, tmp_path)
-    begun = train_fitvid(replace(settings, seed=1) if damage == "other settings" else settings)
-    while next(begun).done < 2:
-        pass
-    begun.close()
+    stop(replace(settings, seed=1) if damage == "other settings" else settings, 2)
     checkpoint = settings.out.with_suffix(".checkpoint")
     if damage == "cut short":
         checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     assert next(iter(train_fitvid(settings))).done == 0
-
-
-def test_the_budget_may_grow(data, tmp_path):
-    settings = config(data, tmp_path, iterations=2, measured=1)
-    begun = train_fitvid(settings)
-    while next(begun).done < 1:
-        pass
-    begun.close()
-    steps = list(train_fitvid(replace(settings, iterations=3)))
-    assert (steps[0].done, steps[-1].done) == (1, 3)
 
 
 def test_a_time_budget_ends(data, tmp_path):
@@ -107,9 +95,7 @@ def test_a_time_budget_ends(data, tmp_path):
     ("change", "subject"),
     [
         ({"iterations": 0}, "iterations"),
-        ({"frames": 2}, "frames of a window"),
         ({"frames": 8}, "frames of a window"),
-        ({"rate": float("nan")}, "rate of learning"),
         ({"precision": "float64"}, "precision"),
         ({"seed": -1}, "seed"),
         ({"device": "tpu"}, "device"),
@@ -168,14 +154,10 @@ def test_at_most_a_fifth_of_the_side_is_cropped():
 # Frame windows
 
 
-def test_one_episode_in_twelve_is_held_out(data):
-    with VideoFiles((data, data)) as files:
-        assert (files.side, len(files.learned), len(files.held_out)) == (16, 24, 4)
-
-
 def test_windows_are_stretches_of_the_episodes(data):
     episodes = read_pushes(data)
-    with VideoFiles((data,)) as files:
+    with VideoFiles((data, data)) as files:
+        assert (files.side, len(files.learned), len(files.held_out)) == (16, 24, 4)
         some = windows([files.held_out[0], files.held_out[1]], np.array([1, 2]), 3)
         for n, (number, start) in enumerate(((0, 1), (12, 2))):
             np.testing.assert_array_equal(some.frames[n], episodes[number].frames[start : start + 4])
@@ -188,12 +170,6 @@ def test_windows_are_stretches_of_the_episodes(data):
             files.drawn(np.random.default_rng(0), 1, 7)
 
 
-def test_objects_that_never_meet_are_not_learned_from(tmp_path):
-    pair = ("005_tomato_soup_can", "010_potted_meat_can")
-    with pytest.raises(InvalidInput, check=about("learn from")):
-        VideoFiles((write_videos(tmp_path / "a.h5", names=pair),))
-
-
 def test_files_without_frames_and_of_other_kinds_are_refused(data, tmp_path):
     with pytest.raises(CorruptFile, check=about("no frames")):
         VideoFiles((write_videos(tmp_path / "plain.h5", count=2, with_frames=False),))
@@ -201,8 +177,10 @@ def test_files_without_frames_and_of_other_kinds_are_refused(data, tmp_path):
         VideoFiles((write_videos(tmp_path / "short.h5", count=2, steps=1),))
     with pytest.raises(InvalidInput, check=about("sizes")):
         VideoFiles((data, write_videos(tmp_path / "large.h5", side=32, count=2)))
-    with pytest.raises(InvalidInput, check=about("learn from")):
-        VideoFiles((write_videos(tmp_path / "one.h5", count=1),))
+    never_meet = ("005_tomato_soup_can", "010_potted_meat_can")
+    for name, more in (("one", {"count": 1}), ("pair", {"names": never_meet})):
+        with pytest.raises(InvalidInput, check=about("learn from")):
+            VideoFiles((write_videos(tmp_path / f"{name}.h5", **more),))
 
 
 # Measurement
