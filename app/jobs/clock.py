@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 
 class JobClock:
-    """Time left of a job, pauses left out."""
+    """Estimate the time left of a job, pauses left out.
 
-    def __init__(self) -> None:
+    Args:
+        now_s: the time that counts [s].
+    """
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
         self._first: tuple[int, float] | None = None
         self._paused_at: float | None = None
         self._paused_s = 0.0
 
     def switch(self, *, is_running: bool) -> None:
         """The job pauses, or goes on."""
-        now = time.monotonic()
+        now = self._now_s()
         if not is_running:
             self._paused_at = now
         elif self._paused_at is not None:
@@ -26,7 +32,7 @@ class JobClock:
         """Time left [s], once there is something to go by; it counts from when the total is known."""
         if total == 0:
             return None
-        now = time.monotonic() - self._paused_s
+        now = self._now_s() - self._paused_s
         if self._first is None:
             self._first = (done, now)
         first_done, start = self._first
