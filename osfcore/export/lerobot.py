@@ -129,12 +129,12 @@ def pooled(parts: Sequence[Statistics]) -> Statistics:
         return np.tensordot(shares, np.stack(values), axes=1)
 
     mean = mean_of([part["mean"] for part in parts])
-    spread = mean_of([part["std"] ** 2 + (part["mean"] - mean) ** 2 for part in parts])
+    variance = mean_of([part["std"] ** 2 + (part["mean"] - mean) ** 2 for part in parts])
     return {
         "min": np.min([part["min"] for part in parts], axis=0),
         "max": np.max([part["max"] for part in parts], axis=0),
         "mean": mean,
-        "std": np.sqrt(spread),
+        "std": np.sqrt(variance),
         "count": np.array([counts.sum()]),
         **{key: mean_of([part[key] for part in parts]) for key in _QUANTILES},
     }
@@ -264,7 +264,21 @@ class _Writer:
         found = {key: statistics_of(rows.astype(float)) for key, rows in plain.items()}
         found |= {key: image_statistics(images) for key, images in episode.videos.items()}
         self._statistics.append(found)
-        self._rows.append(_row(episode, number, self._frames, place, found))
+        row: dict[str, Any] = {
+            "episode_index": number,
+            "tasks": [episode.task],
+            "length": count,
+            "dataset_from_index": self._frames,
+            "dataset_to_index": self._frames + count,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+            **{f"data/{key}": value for key, value in place.items()},
+        }
+        video = {**place, "from_timestamp": 0.0, "to_timestamp": count * STEP_S}
+        for key in episode.videos:
+            row |= {f"videos/{key}/{name}": value for name, value in video.items()}
+        row |= {f"stats/{key}/{name}": value for key, one in found.items() for name, value in _plain(one).items()}
+        self._rows.append(row)
         self._frames += count
 
     def close(self) -> DatasetSize:
@@ -294,29 +308,8 @@ class _Writer:
                 raise InvalidInput("size of images [px]", images.shape[1:3], "even, as videos need it")
         shapes = {key: rows.shape[1:] for key, rows in arrays.items()}
         if self._shapes and shapes != self._shapes:
-            raise InvalidInput(f"what episode {len(self._rows)} tells", shapes, f"as in the first one, {self._shapes}")
+            raise InvalidInput(f"what episode {len(self._rows)} holds", shapes, f"as in the first one, {self._shapes}")
         self._shapes = shapes
-
-
-def _row(
-    episode: LeRobotEpisode, number: int, first: int, place: Mapping[str, int], found: Mapping[str, Statistics]
-) -> dict[str, Any]:
-    """Return an episode's row of the table of episodes."""
-    count = len(episode.actions)
-    row = {
-        "episode_index": number,
-        "tasks": [episode.task],
-        "length": count,
-        "dataset_from_index": first,
-        "dataset_to_index": first + count,
-        "meta/episodes/chunk_index": 0,
-        "meta/episodes/file_index": 0,
-        **{f"data/{key}": value for key, value in place.items()},
-    }
-    for key in episode.videos:
-        times_s = {"from_timestamp": 0.0, "to_timestamp": count * STEP_S}
-        row |= {f"videos/{key}/{name}": value for name, value in {**place, **times_s}.items()}
-    return row | {f"stats/{key}/{name}": v for key, one in found.items() for name, v in _plain(one).items()}
 
 
 def _plain(found: Statistics) -> dict[str, Any]:
@@ -346,7 +339,7 @@ def _info(shapes: Mapping[str, tuple[int, ...]], size: DatasetSize) -> dict[str,
 
 
 def _feature(key: str, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Describe a feature of a data set."""
+    """Describe a feature of a data set, whose key says what it is."""
     if key.startswith(IMAGES):
         video = {"height": shape[0], "width": shape[1], "codec": _CODEC, "pix_fmt": _PIXELS, "is_depth_map": False}
         video |= {"fps": FPS, "channels": 3}

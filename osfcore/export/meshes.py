@@ -69,7 +69,10 @@ def glb(
         matrix = camera.T_world_camera.matrix() @ OPENCV_TO_GLTF
         graph.update(frame_from=TABLE_FRAME, frame_to=camera_node(camera), matrix=matrix)
     if light is not None:
-        _add_light(scene, light)
+        extras = {"gltf_extensions": {LIGHTS_EXTENSION: {"light": 0}}, "ambient": AMBIENT, "diffuse": DIFFUSE}
+        graph.update(frame_from=TABLE_FRAME, frame_to=LIGHT_NODE, matrix=light_matrix(light), metadata=extras)
+        sun = {"type": "directional", "name": LIGHT_NODE, "color": [1.0, 1.0, 1.0], "intensity": DIFFUSE * np.pi}
+        scene.metadata["gltf_extensions"] = {LIGHTS_EXTENSION: {"lights": [sun]}}
 
     def complete(tree: dict[str, Any]) -> dict[str, Any]:
         _add_cameras(tree, cameras)
@@ -92,28 +95,15 @@ def light_matrix(light: Light) -> Float[np.ndarray, "4 4"]:
     return matrix
 
 
-def _add_light(scene: trimesh.Scene, light: Light) -> None:
-    matrix = light_matrix(light)
-    extras = {"gltf_extensions": {LIGHTS_EXTENSION: {"light": 0}}, "ambient": AMBIENT, "diffuse": DIFFUSE}
-    scene.graph.update(frame_from=TABLE_FRAME, frame_to=LIGHT_NODE, matrix=matrix, metadata=extras)
-    sun = {"type": "directional", "name": LIGHT_NODE, "color": [1.0, 1.0, 1.0], "intensity": DIFFUSE * np.pi}
-    scene.metadata["gltf_extensions"] = {LIGHTS_EXTENSION: {"lights": [sun]}}
-
-
 def _add_cameras(tree: dict[str, Any], cameras: tuple[Camera, ...]) -> None:
     """Add the cameras, with their intrinsics, to the nodes that bear their names."""
-    if cameras:
-        tree["cameras"] = [_camera(camera) for camera in cameras]
-    numbers = {camera_node(camera): number for number, camera in enumerate(cameras)}
-    for node in tree["nodes"]:
-        if node["name"] in numbers:
-            node["camera"] = numbers[node["name"]]
-
-
-def _camera(camera: Camera) -> dict[str, Any]:
-    perspective = {"yfov": camera.fov_y_rad, "aspectRatio": camera.width / camera.height, "znear": _NEAR_M}
-    extras = {"K": camera.intrinsics.tolist(), "width": camera.width, "height": camera.height}
-    return {"type": "perspective", "name": camera.name, "perspective": perspective, "extras": extras}
+    nodes = {node["name"]: node for node in tree["nodes"]}
+    for number, camera in enumerate(cameras):
+        perspective = {"yfov": camera.fov_y_rad, "aspectRatio": camera.width / camera.height, "znear": _NEAR_M}
+        extras = {"K": camera.intrinsics.tolist(), "width": camera.width, "height": camera.height}
+        entry = {"type": "perspective", "name": camera.name, "perspective": perspective, "extras": extras}
+        tree.setdefault("cameras", []).append(entry)
+        nodes[camera_node(camera)]["camera"] = number
 
 
 def _add_materials(tree: dict[str, Any], *, is_unlit: bool) -> None:
@@ -236,25 +226,17 @@ def scene_meshes(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], tab
     Raises:
         InvalidInput: if nothing in a field is solid.
     """
-    meshes = trimesh.Scene()
-    _add(meshes, TABLE_NODE, _table_mesh(table), Pose.identity())
+    parts = {TABLE_NODE: (_table_mesh(table), Pose.identity())}
     if scene.state.pusher is not None:
-        upright = Pose(scene.state.pusher, Pose.identity().quaternion)
-        _add(meshes, PUSHER_NODE, _pusher_mesh(), upright)
+        parts[PUSHER_NODE] = _pusher_mesh(), Pose(scene.state.pusher, Pose.identity().quaternion)
     for name in scene.state.names:
-        shape = shapes[name]
+        shape, node = shapes[name], f"object {name}" if name in (TABLE_NODE, PUSHER_NODE) else name
         mesh = coloured_mesh(shape) if isinstance(shape, KiloOSF) else light_mesh(shape, MAX_TEXTURE_SIDE)
-        _add(meshes, object_node(name), mesh, scene.state.pose(name))
+        parts[node] = mesh, scene.state.pose(name)
+    meshes = trimesh.Scene()
+    for node, (mesh, pose) in parts.items():
+        meshes.add_geometry(mesh, node_name=node, geom_name=node, transform=pose.matrix())
     return meshes
-
-
-def object_node(name: str) -> str:
-    """Name an object's node."""
-    return f"object {name}" if name in (TABLE_NODE, PUSHER_NODE) else name
-
-
-def _add(scene: trimesh.Scene, node: str, mesh: trimesh.Trimesh, pose: Pose) -> None:
-    scene.add_geometry(mesh, node_name=node, geom_name=node, transform=pose.matrix())
 
 
 def _table_mesh(table: TableField) -> trimesh.Trimesh:

@@ -23,7 +23,7 @@ from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
 
 SH_C0 = 0.5 / np.sqrt(np.pi)  # the spherical harmonic of degree 0
-_OPACITY = 0.95
+_OPACITY = 0.95  # of every disc
 _NEIGHBOURS = 6
 _WIDTH, _THICKNESS = 0.45, 0.1  # standard deviations across and along the normal, per distance to the neighbours
 _FIELDS = (
@@ -42,7 +42,6 @@ class Splats:
         colours: in [0, 1], the same from all sides.
         deviations: along each Gaussian's own axes [m].
         quaternions: from its axes to the field's frame (w, x, y, z); its z axis is the normal.
-        opacity: of all of them.
         light: under which the colours are.
     """
 
@@ -51,7 +50,6 @@ class Splats:
     colours: Float32[np.ndarray, "S 3"]
     deviations: Float32[np.ndarray, "S 3"]
     quaternions: Float32[np.ndarray, "S 4"]
-    opacity: float
     light: Light
 
 
@@ -73,22 +71,12 @@ def field_splats(field: KiloOSF, light: Light) -> Splats:
     points, colours = baked(field, np.array(mesh.vertices), normals, light)
     distances, _ = KDTree(points).query(points, k=_NEIGHBOURS + 1)
     spacing = distances[:, 1:].mean(axis=1, keepdims=True)
-    return Splats(
-        points,
-        normals.astype(np.float32),
-        colours,
-        (spacing * (_WIDTH, _WIDTH, _THICKNESS)).astype(np.float32),
-        _from_z(normals),
-        _OPACITY,
-        light,
-    )
-
-
-def _from_z(normals: np.ndarray) -> Float32[np.ndarray, "S 4"]:
-    """Return the shortest rotations from z to unit vectors: (1 + n_z, -n_y, n_x, 0), normalized."""
+    deviations = (spacing * (_WIDTH, _WIDTH, _THICKNESS)).astype(np.float32)
+    # The shortest rotations from z to unit vectors n are (1 + n_z, -n_y, n_x, 0), normalized.
     q = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1)
     q[normals[:, 2] < -1 + 1e-6] = (0, 1, 0, 0)  # straight down: half a turn about x
-    return (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
+    quaternions = (q / np.linalg.norm(q, axis=1, keepdims=True)).astype(np.float32)
+    return Splats(points, normals.astype(np.float32), colours, deviations, quaternions, light)
 
 
 def splats_ply(splats: Splats) -> bytes:
@@ -108,7 +96,7 @@ def splats_ply(splats: Splats) -> bytes:
         splats.means,
         splats.normals,
         (splats.colours - 0.5) / SH_C0,
-        np.full((len(splats.means), 1), np.log(splats.opacity / (1 - splats.opacity))),
+        np.full((len(splats.means), 1), np.log(_OPACITY / (1 - _OPACITY))),
         np.log(splats.deviations),
         splats.quaternions,
     )

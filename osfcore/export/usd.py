@@ -9,6 +9,7 @@ Raises:
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,9 +17,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from jaxtyping import Float
-from PIL import Image
-from trimesh.visual import ColorVisuals, TextureVisuals
-from trimesh.visual.material import PBRMaterial
+from trimesh.visual import TextureVisuals
 
 from osfcore.export.meshes import OPENCV_TO_GLTF, camera_node, field_meshes, light_matrix, scene_meshes
 from osfcore.extras import need
@@ -37,86 +36,60 @@ _CLIPPING_M = (0.01, 100.0)
 _TYPES, _TEXTURES = Sdf.ValueTypeNames, "textures"
 
 
-class Materials:
-    """Matte materials (UsdPreviewSurface), one for each mesh: a texture, or the colours of its vertices.
+def bind_material(stage: Usd.Stage, prim: UsdGeom.Mesh, mesh: trimesh.Trimesh, folder: Path, *, is_unlit: bool) -> None:
+    """Give a mesh a matte material (UsdPreviewSurface), below it in the stage: its texture, or its vertices' colours.
 
     Args:
-        stage: for the materials.
+        stage: that holds the mesh.
+        prim: the mesh in it.
+        mesh: its colours; a texture is the JPEG that `light_mesh` has made.
         folder: of the stage's layer; textures are written to a folder in it.
         is_unlit: colours are sent out as they are.
     """
+    path = prim.GetPath().AppendChild("material")
+    material = UsdShade.Material.Define(stage, path)
+    shown, black = ("emissiveColor", "diffuseColor") if is_unlit else ("diffuseColor", "emissiveColor")
 
-    def __init__(self, stage: Usd.Stage, folder: Path, *, is_unlit: bool) -> None:
-        self._stage, self._folder = stage, folder
-        self._input, self._other = ("emissiveColor", "diffuseColor") if is_unlit else ("diffuseColor", "emissiveColor")
+    def shader(kind: str) -> UsdShade.Shader:
+        made = UsdShade.Shader.Define(stage, path.AppendChild(kind))
+        made.CreateIdAttr(kind)
+        return made
 
-    def bind(self, prim: UsdGeom.Mesh, mesh: trimesh.Trimesh) -> None:
-        """Give a mesh its material, below it in the stage."""
-        path = prim.GetPath().AppendChild("material")
-        material = UsdShade.Material.Define(self._stage, path)
-        surface = self._shader(path, "UsdPreviewSurface")
-        surface.CreateInput("roughness", _TYPES.Float).Set(1.0)
-        surface.CreateInput("useSpecularWorkflow", _TYPES.Int).Set(1)  # only so can all reflection be diffuse
-        surface.CreateInput("specularColor", _TYPES.Color3f).Set((0.0, 0.0, 0.0))
-        surface.CreateInput(self._other, _TYPES.Color3f).Set((0.0, 0.0, 0.0))
-        texture = _texture_of(mesh)
-        colour = self._vertex_colours(path) if texture is None else self._texture(path, texture)
-        surface.CreateInput(self._input, _TYPES.Color3f).ConnectToSource(colour)
-        material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", _TYPES.Token))
-        UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
-
-    def _texture(self, path: Sdf.Path, image: Image.Image) -> UsdShade.Output:
-        file = f"{_TEXTURES}/{path.GetParentPath().name}.jpg"
-        (self._folder / _TEXTURES).mkdir(exist_ok=True)
-        image.save(self._folder / file, format="JPEG", quality="keep")
-        reader = self._shader(path, "UsdPrimvarReader_float2")
+    surface = shader("UsdPreviewSurface")
+    surface.CreateInput("roughness", _TYPES.Float).Set(1.0)
+    surface.CreateInput("useSpecularWorkflow", _TYPES.Int).Set(1)  # only so can all reflection be diffuse
+    surface.CreateInput("specularColor", _TYPES.Color3f).Set((0.0, 0.0, 0.0))
+    surface.CreateInput(black, _TYPES.Color3f).Set((0.0, 0.0, 0.0))
+    if isinstance(mesh.visual, TextureVisuals):
+        file = f"{_TEXTURES}/{prim.GetPath().name}.jpg"
+        (folder / _TEXTURES).mkdir(exist_ok=True)
+        mesh.visual.material.baseColorTexture.save(folder / file, format="JPEG", quality="keep")
+        reader = shader("UsdPrimvarReader_float2")
         reader.CreateInput("varname", _TYPES.String).Set("st")
-        texture = self._shader(path, "UsdUVTexture")
+        texture = shader("UsdUVTexture")
         texture.CreateInput("file", _TYPES.Asset).Set(f"./{file}")
         texture.CreateInput("sourceColorSpace", _TYPES.Token).Set("sRGB")
         for side in ("wrapS", "wrapT"):
             texture.CreateInput(side, _TYPES.Token).Set("clamp")
         texture.CreateInput("st", _TYPES.Float2).ConnectToSource(reader.CreateOutput("result", _TYPES.Float2))
-        return texture.CreateOutput("rgb", _TYPES.Float3)
-
-    def _vertex_colours(self, path: Sdf.Path) -> UsdShade.Output:
-        reader = self._shader(path, "UsdPrimvarReader_float3")
+        colour = texture.CreateOutput("rgb", _TYPES.Float3)
+    else:
+        reader = shader("UsdPrimvarReader_float3")
         reader.CreateInput("varname", _TYPES.String).Set("displayColor")
-        return reader.CreateOutput("result", _TYPES.Float3)
-
-    def _shader(self, path: Sdf.Path, kind: str) -> UsdShade.Shader:
-        shader = UsdShade.Shader.Define(self._stage, path.AppendChild(kind))
-        shader.CreateIdAttr(kind)
-        return shader
+        colour = reader.CreateOutput("result", _TYPES.Float3)
+    surface.CreateInput(shown, _TYPES.Color3f).ConnectToSource(colour)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", _TYPES.Token))
+    UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
 
 
-def _texture_of(mesh: trimesh.Trimesh) -> Image.Image | None:
-    """Return the JPEG that `light_mesh` has made; None for a mesh with vertex colours."""
-    material = mesh.visual.material if isinstance(mesh.visual, TextureVisuals) else None
-    return material.baseColorTexture if isinstance(material, PBRMaterial) else None
-
-
-class Names:
-    """Paths of prims below /World for names of any characters, each path once."""
-
-    def __init__(self) -> None:
-        self._shown: dict[Sdf.Path, str] = {}
-
-    def take(self, name: str) -> Sdf.Path:
-        """Reserve a free path for a name."""
-        start = name if name[:1].isalpha() else f"_{name}"  # 006 would become _06
-        stem, count = Tf.MakeValidIdentifier(start), 1
-        path = Sdf.Path(f"/World/{stem}")
-        while path in self._shown:
-            count += 1
-            path = Sdf.Path(f"/World/{stem}_{count}")
-        self._shown[path] = name
-        return path
-
-    def show(self, stage: Usd.Stage) -> None:
-        """Set the exact names as display names of the prims."""
-        for path, name in self._shown.items():
-            stage.GetPrimAtPath(path).SetDisplayName(name)
+def free_path(shown: dict[Sdf.Path, str], name: str) -> Sdf.Path:
+    """Reserve a path below /World for a name of any characters, in a dictionary of those that are taken."""
+    stem = Tf.MakeValidIdentifier(name if name[:1].isalpha() else f"_{name}")  # 006 would become _06
+    path, numbers = Sdf.Path(f"/World/{stem}"), itertools.count(2)
+    while path in shown:
+        path = Sdf.Path(f"/World/{stem}_{next(numbers)}")
+    shown[path] = name
+    return path
 
 
 def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: trimesh.Trimesh, matrix: Float[np.ndarray, "4 4"]) -> UsdGeom.Mesh:
@@ -135,7 +108,7 @@ def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: trimesh.Trimesh, matrix: Fl
     if isinstance(mesh.visual, TextureVisuals):
         uv = Vt.Vec2fArray.FromNumpy(np.array(mesh.visual.uv, np.float32))
         primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, kind).Set(uv)
-    elif isinstance(mesh.visual, ColorVisuals):
+    else:
         colours = np.asarray(mesh.visual.vertex_colors, np.float32)[:, :3] / 255  # linear, as USD has them
         prim.CreateDisplayColorPrimvar(kind).Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colours)))
     return prim
@@ -154,7 +127,7 @@ def add_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
     prim.CreateClippingRangeAttr(Gf.Vec2f(*_CLIPPING_M))
 
 
-def add_light(stage: Usd.Stage, names: Names, light: Light) -> None:
+def add_light(stage: Usd.Stage, shown: dict[Sdf.Path, str], light: Light) -> None:
     """Add the parallel and the ambient light, under which a white matte surface sends out 0.75 and 0.25.
 
     A distant light of angle 0 has the illuminance of its intensity: 0.75 pi. A dome of radiance 0.25 lights everything
@@ -162,12 +135,12 @@ def add_light(stage: Usd.Stage, names: Names, light: Light) -> None:
 
     Deviation: in some renderers objects shade each other from the dome's light; here they do not.
     """
-    distant = UsdLux.DistantLight.Define(stage, names.take("light"))
+    distant = UsdLux.DistantLight.Define(stage, free_path(shown, "light"))
     _place(distant, light_matrix(light))
     distant.CreateAngleAttr(0.0)  # hard shadows
     distant.CreateIntensityAttr(DIFFUSE * np.pi)
     distant.CreateNormalizeAttr(True)
-    UsdLux.DomeLight.Define(stage, names.take("ambient light")).CreateIntensityAttr(AMBIENT)
+    UsdLux.DomeLight.Define(stage, free_path(shown, "ambient light")).CreateIntensityAttr(AMBIENT)
 
 
 def _place(prim: UsdGeom.Xformable, matrix: Float[np.ndarray, "4 4"]) -> None:
@@ -221,17 +194,18 @@ def _content(
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         world = UsdGeom.Xform.Define(stage, "/World")
         stage.SetDefaultPrim(world.GetPrim())
-        names, materials = Names(), Materials(stage, layer.parent, is_unlit=is_unlit)
+        shown: dict[Sdf.Path, str] = {}  # the exact names, by path
         for node in scene.graph.nodes_geometry:
             matrix, geometry = scene.graph.get(node)
             mesh = scene.geometry[geometry]
-            prim = add_mesh(stage, names.take(node), mesh, matrix)
-            materials.bind(prim, mesh)
+            prim = add_mesh(stage, free_path(shown, node), mesh, matrix)
+            bind_material(stage, prim, mesh, layer.parent, is_unlit=is_unlit)
         for camera in cameras:
-            add_camera(stage, names.take(camera_node(camera)), camera)
+            add_camera(stage, free_path(shown, camera_node(camera)), camera)
         if light is not None:
-            add_light(stage, names, light)
-        names.show(stage)
+            add_light(stage, shown, light)
+        for path, name in shown.items():
+            stage.GetPrimAtPath(path).SetDisplayName(name)
         stage.GetRootLayer().Save()
         if not is_packed:
             return layer.read_bytes()

@@ -58,27 +58,16 @@ def contact_sheet(
     """
     if len({c.truth.shape for c in columns} | {c.ours.shape for c in columns}) != 1:
         raise InvalidInput("images of a contact sheet", f"{len(columns)} pairs", "at least one, all of one size")
-    blocks = [_block(columns[i : i + per_row], truth) for i in range(0, len(columns), per_row)]
+    blocks = []
+    for i in range(0, len(columns), per_row):
+        shown = columns[i : i + per_row]
+        rows = {truth: [c.truth for c in shown], "ours": [c.ours for c in shown]}
+        differences = [DIFFERENCE_GAIN * np.abs(c.truth.astype(int) - c.ours) for c in shown]
+        rows[f"diff x{DIFFERENCE_GAIN}"] = [np.clip(difference, 0, 255).astype(np.uint8) for difference in differences]
+        blocks.append(_grid(rows, [c.label for c in shown], _ROW_LABEL_PX))
     width = max(block.shape[1] for block in blocks)
     padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=_PAPER) for b in blocks]
     return np.vstack(padded)
-
-
-def _block(columns: Sequence[Comparison], first: str) -> UInt8[np.ndarray, "H W 3"]:
-    """Put columns into three rows, with a line of labels above and a margin of row names on the left."""
-    height, width = columns[0].truth.shape[:2]
-    sheet = np.full((_LABEL_PX + 3 * height, _ROW_LABEL_PX + len(columns) * width, 3), _PAPER, np.uint8)
-    for row, name in enumerate((first, "ours", f"diff x{DIFFERENCE_GAIN}")):
-        put_text(sheet, name, (1, _LABEL_PX + row * height + height // 2), _ROW_LABEL_PX)
-    for number, column in enumerate(columns):
-        left = _ROW_LABEL_PX + number * width
-        put_text(sheet, column.label, (left + 2, _LABEL_PX - 5), width - 4)
-        difference = np.abs(column.truth.astype(int) - column.ours)
-        shown = np.clip(DIFFERENCE_GAIN * difference, 0, 255).astype(np.uint8)
-        for row, image in enumerate((column.truth, column.ours, shown)):
-            top = _LABEL_PX + row * height
-            sheet[top : top + height, left : left + width] = image
-    return sheet
 
 
 def image_grid(
@@ -96,14 +85,21 @@ def image_grid(
     shapes = {image.shape for row in rows.values() for image in row}
     if len(shapes) != 1 or {len(row) for row in rows.values()} != {len(columns)}:
         raise InvalidInput("images of a grid", f"{len(rows)} rows", "full rows of images, all of one size")
-    height, width = shapes.pop()[:2]
-    sheet = np.full((_LABEL_PX + len(rows) * height, _NAME_PX + len(columns) * width, 3), _PAPER, np.uint8)
+    return _grid(rows, columns, _NAME_PX)
+
+
+def _grid(
+    rows: Mapping[str, Sequence[UInt8[np.ndarray, "h w 3"]]], columns: Sequence[str], margin: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Put images of one size into rows and columns; the rows' names have a margin of so many pixels on the left."""
+    height, width = next(iter(rows.values()))[0].shape[:2]
+    sheet = np.full((_LABEL_PX + len(rows) * height, margin + len(columns) * width, 3), _PAPER, np.uint8)
     for number, name in enumerate(columns):
-        put_text(sheet, name, (_NAME_PX + number * width + 2, _LABEL_PX - 5), width - 4)
+        put_text(sheet, name, (margin + number * width + 2, _LABEL_PX - 5), width - 4)
     for number, (name, images) in enumerate(rows.items()):
         top = _LABEL_PX + number * height
-        put_text(sheet, name, (1, top + height // 2), _NAME_PX)
-        sheet[top : top + height, _NAME_PX:] = np.hstack(images)
+        put_text(sheet, name, (1, top + height // 2), margin)
+        sheet[top : top + height, margin:] = np.hstack(images)
     return sheet
 
 
@@ -126,13 +122,17 @@ _SIDE = 180  # of a mask [px]
 _MASK_COLOUR, _FOUND_COLOUR = (255, 60, 60), (60, 220, 60)
 
 
-def sheet(models: PhotoModels, photo: Photograph, found: PhotoObject) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw the photo, the outlines of the mask (red) and of the pose (green) in it, and the object in its pose.
+def write_sheet(path: Path, models: PhotoModels, photo: Photograph, found: PhotoObject) -> None:
+    """Draw a PNG of the photo, the outlines of mask (red) and pose (green) in it, and the object in its pose.
 
     Args:
+        path: of the file.
         models: of the objects.
         photo: in whose frame the pose is.
         found: the object and its pose.
+
+    Raises:
+        CannotWrite: if the disk refuses.
     """
     window = object_windows([photo], found.name, _SIDE)[0]
     surfels, pose = models.surfels(found.name, FINE_ACROSS), found.best.pose
@@ -144,57 +144,35 @@ def sheet(models: PhotoModels, photo: Photograph, found: PhotoObject) -> UInt8[n
         contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(outlined, contours, -1, colour, 1)
     albedo = np.where(shown[..., None], surfels.albedo[np.maximum(index, 0)], 0)
-    return np.hstack([picture, outlined, to_uint8(srgb_of_linear(albedo))])
+    write_png(path, np.hstack([picture, outlined, to_uint8(srgb_of_linear(albedo))]))
 
 
-def write_sheet(path: Path, models: PhotoModels, photo: Photograph, found: PhotoObject) -> None:
-    """Write a sheet as PNG.
-
-    Raises:
-        CannotWrite: if the disk refuses.
-    """
-    write_png(path, sheet(models, photo, found))
-
-
-VIEWS, SIDE = 24, 96
+_VIEWS, _VIEW_SIDE = 24, 96
 _FIELD_OF_VIEW_DEG = 24.0
 _ELEVATION_RAD = np.deg2rad(22.0)
 _LIGHT_TURN_RAD, _LIGHT_ELEVATION_RAD = np.deg2rad(-50.0), np.deg2rad(48.0)  # from the left, above the camera
 
 
-def turntable(mesh: TexturedMesh, views: int = VIEWS, side: int = SIDE) -> UInt8[np.ndarray, "side width 4"]:
-    """Render an object that turns once under a lamp that stays, by the project's image model; views side by side.
+def turntable_png(mesh: TexturedMesh) -> bytes:
+    """Render an object that turns once under a lamp that stays: 24 views of 96 x 96 pixels, side by side, as PNG.
 
-    Args:
-        mesh: the object.
-        views: how many, 360 / views degrees apart.
-        side: of each [px].
-
-    Returns:
-        RGBA, transparent around the object; not premultiplied.
+    It is transparent around the object, and not premultiplied.
     """
     traced = TracedMesh(mesh)
     tracer = RayTracer({"object": traced})
     distance = 1.02 * traced.radius_m / np.sin(np.deg2rad(_FIELD_OF_VIEW_DEG) / 2)
     pictures = []
-    for azimuth in 2 * np.pi * np.arange(views) / views:
+    for azimuth in 2 * np.pi * np.arange(_VIEWS) / _VIEWS:
         position = distance * _direction(azimuth, _ELEVATION_RAD)
-        camera = Camera.look_at("turn", position, (0, 0, 0), size=side, fov_y_deg=_FIELD_OF_VIEW_DEG)
+        camera = Camera.look_at("turn", position, (0, 0, 0), size=_VIEW_SIDE, fov_y_deg=_FIELD_OF_VIEW_DEG)
         light = _direction(azimuth + _LIGHT_TURN_RAD, _LIGHT_ELEVATION_RAD)
         picture = tracer.render_alone("object", light, camera)
         alpha = picture.coverage[0]
         colour = picture.rgb / np.maximum(alpha, 1e-3)[..., None]
-        pictures.append(np.concatenate([to_uint8(colour), to_uint8(alpha)[..., None]], axis=-1))
-    return np.concatenate(pictures, axis=1)
+        pictures.append(np.dstack([to_uint8(colour[..., ::-1]), to_uint8(alpha)]))
+    return cv2.imencode(".png", np.hstack(pictures), [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()
 
 
 def _direction(azimuth: float, elevation: float) -> np.ndarray:
     level = np.cos(elevation)
     return np.array([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)])
-
-
-def turntable_png(mesh: TexturedMesh) -> bytes:
-    """Return the views of `turntable` as PNG."""
-    picture = turntable(mesh)
-    in_file_order = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA)
-    return cv2.imencode(".png", in_file_order, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()

@@ -122,19 +122,10 @@ def draw_text(bgr: UInt8[np.ndarray, "h w 3"], text: str, place: tuple[int, int]
         cv2.putText(bgr, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, shade, 1, cv2.LINE_AA)
 
 
-MASK_COLOURS = np.array(
-    [
-        [230, 85, 60],
-        [60, 140, 230],
-        [70, 180, 90],
-        [235, 180, 50],
-        [160, 95, 210],
-        [40, 190, 190],
-        [235, 110, 170],
-        [140, 120, 90],
-    ],
-    np.uint8,
-)
+MASK_COLOURS = np.array([
+    [230, 85, 60], [60, 140, 230], [70, 180, 90], [235, 180, 50],
+    [160, 95, 210], [40, 190, 190], [235, 110, 170], [140, 120, 90],
+], np.uint8)  # fmt: skip
 
 
 def tint_masks(pixels: UInt8[np.ndarray, "h w 3"], masks: Bool[np.ndarray, "N h w"]) -> UInt8[np.ndarray, "h w 3"]:

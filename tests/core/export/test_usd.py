@@ -7,16 +7,12 @@ import pytest
 from PIL import Image
 from pxr import Ar, Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
-from osfcore.estimation.camera_response import linear_of_srgb
 from osfcore.export.usd import field_usd, scene_usdz
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera, default_cameras
-from osfcore.geometry.light import Light
 from osfcore.io.scene_file import Scene
-from tests.support.ellipsoid import ALBEDO, HALF, ellipsoid_normals
 
 MUSTARD = "006_mustard_bottle"
-LIGHT = Light(np.array([1.0, -0.5, 0.8]))
 OFF_CENTRE = Camera(
     "off centre", default_cameras()[1].T_world_camera, np.array([[90.0, 0, 40], [0, 80, 20], [0, 0, 1]]), 96, 64
 )
@@ -45,18 +41,14 @@ def stage(scene, shapes, one_thread, tmp_path_factory):
     return opened(content, tmp_path_factory.mktemp("usd"))
 
 
-def faults(stage):
+def assert_faultless(stage):
+    """Pixar's own checks find nothing."""
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    return [error.GetErrorAsString() for error in UsdValidation.ValidationContext(validators).Validate(stage)]
-
-
-def test_pixars_checks_find_no_fault(stage, solid, tmp_path, one_thread):
-    assert faults(stage) == []
-    assert faults(opened(field_usd(solid, "solid"), tmp_path)) == []
-    assert faults(opened(field_usd(solid, "solid", LIGHT, is_packed=False), tmp_path, ".usdc")) == []
+    assert [e.GetErrorAsString() for e in UsdValidation.ValidationContext(validators).Validate(stage)] == []
 
 
 def test_everything_stands_where_the_scene_says(scene, stage, library):
+    assert_faultless(stage)
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert stage.GetDefaultPrim().GetPath() == "/World"
@@ -71,9 +63,9 @@ def test_everything_stands_where_the_scene_says(scene, stage, library):
     np.testing.assert_allclose(pose_of(shown_as(stage, "pusher"))[:3, 3], scene.state.pusher, atol=1e-9)
 
 
-def test_the_light_is_the_parallel_and_the_ambient_one(stage):
+def test_the_light_is_the_parallel_and_the_ambient_one(stage, light):
     distant = UsdLux.DistantLight(shown_as(stage, "light"))
-    np.testing.assert_allclose(pose_of(distant.GetPrim())[:3, 2], LIGHT.direction, atol=1e-9)
+    np.testing.assert_allclose(pose_of(distant.GetPrim())[:3, 2], light.direction, atol=1e-9)
     assert distant.GetIntensityAttr().Get() / np.pi == pytest.approx(0.75)
     assert distant.GetAngleAttr().Get() == 0
     (dome,) = (prim for prim in stage.Traverse() if prim.IsA(UsdLux.DomeLight))
@@ -109,15 +101,14 @@ def test_the_texture_is_kept_and_stands_upright(stage, library):
     np.testing.assert_allclose(UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get(), mesh.uv, atol=1e-6)
 
 
-@pytest.mark.parametrize(("light", "colour"), [(None, "diffuseColor"), (LIGHT, "emissiveColor")])
-def test_a_field_s_surface_has_its_colours(light, colour, solid, tmp_path, one_thread):
-    stage = opened(field_usd(solid, "006 solid", light, is_packed=False), tmp_path, ".usdc")
+@pytest.mark.parametrize(
+    ("is_lit", "colour", "suffix"), [(False, "diffuseColor", ".usdz"), (True, "emissiveColor", ".usdc")]
+)
+def test_a_field_s_surface_has_its_colours(is_lit, colour, suffix, light, solid, assert_solid, tmp_path, one_thread):
+    content = field_usd(solid, "006 solid", light if is_lit else None, is_packed=suffix == ".usdz")
+    stage = opened(content, tmp_path, suffix)
+    assert_faultless(stage)
     prim = shown_as(stage, "006 solid")
     mesh = UsdGeom.Mesh(prim)
-    points = np.array(mesh.GetPointsAttr().Get())
-    np.testing.assert_allclose(np.linalg.norm(points / HALF, axis=1), 1, atol=0.05)
-    cosine = np.maximum(ellipsoid_normals(points) @ LIGHT.direction, 0)
-    shade = np.ones(len(points)) if light is None else 0.25 + 0.75 * cosine
-    colours = np.array(mesh.GetDisplayColorPrimvar().Get())
-    np.testing.assert_allclose(colours, linear_of_srgb(shade[:, None] * np.array(ALBEDO)), atol=0.06)
+    assert_solid(np.array(mesh.GetPointsAttr().Get()), np.array(mesh.GetDisplayColorPrimvar().Get()), is_lit)
     assert source_of(prim, colour).GetInput("varname").Get() == "displayColor"

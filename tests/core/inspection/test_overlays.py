@@ -33,12 +33,9 @@ def test_box_axes_and_light_are_drawn_around_the_object(image_set):
         for column in range(4):
             tile = sheet[256 * row : 256 * (row + 1), 256 * column : 256 * (column + 1)].astype(int)
             is_object = (tile[..., 2] > 1.3 * tile[..., 0]) & (tile[..., 2] > tile[..., 1]) & (tile[..., 1] > 10)
-            ys, xs = np.nonzero(is_object)
-            box_ys, box_xs = np.nonzero((tile[..., 1] < 60) & (tile[..., 0] > 150) & (tile[..., 2] > 150))
-            assert np.percentile(xs, 2) >= box_xs.min()
-            assert np.percentile(xs, 98) <= box_xs.max()
-            assert np.percentile(ys, 2) >= box_ys.min()
-            assert np.percentile(ys, 98) <= box_ys.max()
+            box = np.argwhere((tile[..., 1] < 60) & (tile[..., 0] > 150) & (tile[..., 2] > 150))
+            low, high = np.percentile(np.argwhere(is_object), (2, 98), axis=0)
+            assert np.all((low >= box.min(axis=0)) & (high <= box.max(axis=0)))
 
 
 def test_lines_that_pass_the_camera_are_cut(image_set):
