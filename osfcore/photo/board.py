@@ -1,4 +1,4 @@
-"""The printed board: its pattern, its page, its markers, and the camera's pose over it."""
+"""The printed board: its pattern, its page, its markers, and camera and lens of a photograph that shows it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
+from scipy.optimize import least_squares
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.poses import Pose, quaternion_from_matrix
@@ -18,12 +19,27 @@ Grey = UInt8[np.ndarray, "h w"]
 Image8 = UInt8[np.ndarray, "h w *channels"]
 Intrinsics = Float[np.ndarray, "3 3"]
 Homography = Float[np.ndarray, "3 3"]
+Reflectance = Float[np.ndarray, "h w"]
 Points = Float[np.ndarray, "N 2"]
+Pixel = Int[np.ndarray, "2"]
+Quads = Float[np.ndarray, "M 4 2"]  # corners of markers
 
 
 def camera_matrix(focal: float, x: float, y: float) -> Intrinsics:
     """Return K of a camera with square pixels, from its focal length and principal point [px]."""
     return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
+
+
+def checked_intrinsics(K: np.ndarray, what: str) -> Intrinsics:
+    """Return K of a camera as floating-point numbers.
+
+    Raises:
+        InvalidInput: if K, whose name is `what`, cannot be that of a camera.
+    """
+    K = np.array(K, float)
+    if K.shape != (3, 3) or not np.all(np.isfinite(K)) or not min(K[0, 0], K[1, 1]) > 0 or np.any(K[2] != (0, 0, 1)):
+        raise InvalidInput(what, K.tolist(), "a 3 x 3 matrix with positive focal lengths and last row 0, 0, 1")
+    return K
 
 
 def px_scale(size: tuple[int, int]) -> float:
@@ -55,9 +71,7 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(known[name])
 
 
-def find_markers(
-    grey: Grey, dictionary: cv2.aruco.Dictionary
-) -> tuple[Int[np.ndarray, "M"], Float[np.ndarray, "M 4 2"]]:
+def find_markers(grey: Grey, dictionary: cv2.aruco.Dictionary) -> tuple[Int[np.ndarray, "M"], Quads]:
     """Find the markers of a dictionary, about one pixel exact.
 
     Bits are read leniently, which finds twice as many markers of 10 px as OpenCV's defaults, and wrong ones: whoever
@@ -69,24 +83,20 @@ def find_markers(
     """
     scale = min(max(_DETECTION_SIDE / max(grey.shape), 1.0), _MAX_MARKER_ENLARGEMENT)
     large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC) if scale > 1 else grey
-    quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary, _lenient_parameters()).detectMarkers(large)
+    lenient = cv2.aruco.DetectorParameters()
+    lenient.adaptiveThreshWinSizeMin = 5
+    lenient.adaptiveThreshWinSizeMax = 45
+    lenient.adaptiveThreshWinSizeStep = 8
+    lenient.minMarkerPerimeterRate = 0.01
+    lenient.perspectiveRemovePixelPerCell = 8
+    lenient.perspectiveRemoveIgnoredMarginPerCell = 0.25
+    lenient.maxErroneousBitsInBorderRate = 0.5
+    lenient.errorCorrectionRate = 1.0
+    quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary, lenient).detectMarkers(large)
     if numbers is None:
         return np.zeros(0, int), np.zeros((0, 4, 2))
     corners = np.reshape(quads, (-1, 4, 2)).astype(float)
     return np.ravel(numbers), (corners + 0.5) * np.divide(grey.shape[::-1], large.shape[::-1])
-
-
-def _lenient_parameters() -> cv2.aruco.DetectorParameters:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.adaptiveThreshWinSizeMin = 5
-    parameters.adaptiveThreshWinSizeMax = 45
-    parameters.adaptiveThreshWinSizeStep = 8
-    parameters.minMarkerPerimeterRate = 0.01
-    parameters.perspectiveRemovePixelPerCell = 8
-    parameters.perspectiveRemoveIgnoredMarginPerCell = 0.25
-    parameters.maxErroneousBitsInBorderRate = 0.5
-    parameters.errorCorrectionRate = 1.0
-    return parameters
 
 
 # A flat printed pattern in a photograph, aligned patch by patch to hundredths of a pixel.
@@ -127,7 +137,7 @@ class Pattern:
         patch_m: side of a patch [m].
     """
 
-    image: Float[np.ndarray, "h w"]
+    image: Reflectance
     size_m: tuple[float, float]
     centres_m: Float[np.ndarray, "P 2"]
     patch_m: float
@@ -242,18 +252,10 @@ def _patch_shift(
     return np.append(shift, correlation) if contrast > 0 and np.linalg.norm(shift) < _MAX_SHIFT_PX else missing
 
 
-def _drawn(
-    pattern: Pattern, homography: Homography, low: Int[np.ndarray, "2"], high: Int[np.ndarray, "2"], enlargement: int
-) -> Float[np.ndarray, "h w"]:
+def _drawn(pattern: Pattern, homography: Homography, low: Pixel, high: Pixel, enlargement: int) -> Reflectance:
     """Draw what a camera shows of a pattern between two corners of its image, with values from 0 to 1."""
-    height, width = pattern.image.shape
-    from_pixels = np.array(
-        [
-            [pattern.size_m[0] / width, 0, -pattern.size_m[0] / 2],
-            [0, -pattern.size_m[1] / height, pattern.size_m[1] / 2],
-            [0, 0, 1],
-        ]
-    )
+    (height, width), (wide_m, high_m) = pattern.image.shape, pattern.size_m
+    from_pixels = np.array([[wide_m / width, 0, -wide_m / 2], [0, -high_m / height, high_m / 2], [0, 0, 1]])
     shrink = np.array([[enlargement, 0, -enlargement * low[0]], [0, enlargement, -enlargement * low[1]], [0, 0, 1]])
     warp = np.linalg.inv(_PIXEL_CENTRE) @ shrink @ homography @ from_pixels @ _PIXEL_CENTRE
     columns, rows = (high - low).tolist()
@@ -308,9 +310,8 @@ def planar_pose(points_m: Points, points_px: Points, intrinsics: Intrinsics) -> 
         if T_world_camera.position[2] > 0 and translation[2] > 0 and (best is None or rms < best[1]):
             best = T_world_camera, rms
     if best is None:
-        raise InvalidInput(
-            "side of the print that the photograph shows", "its back", "its front: mirror the photograph"
-        )
+        what = "side of the print that the photograph shows"
+        raise InvalidInput(what, "its back", "its front: mirror the photograph")
     return best
 
 
@@ -364,9 +365,8 @@ def fit_focal(points_m: Points, points_px: Points, size: tuple[int, int], accura
     low, high = np.multiply(_FOCAL_RANGE, max(size))
     start = float(guess) if low < guess < high else float(max(size))
     matrix = camera_matrix(start, size[0] / 2, size[1] / 2)
-    _, matrix, _, rotations, translations = cv2.calibrateCamera(
-        points, pixels, size, matrix, np.zeros(5), flags=_FOCAL_FLAGS
-    )
+    found = cv2.calibrateCamera(points, pixels, size, matrix, np.zeros(5), flags=_FOCAL_FLAGS)
+    _, matrix, _, rotations, translations = found
     seen, jacobian = cv2.projectPoints(points[0], rotations[0], translations[0], matrix, None)
     # The last pivot says how far the points move with the focal length in ways that no motion of the camera explains.
     columns = np.column_stack([jacobian[:, :6], jacobian[:, 6] + jacobian[:, 7]])
@@ -444,7 +444,7 @@ class Board:
         """Return where four squares meet, in the table frame [m]."""
         return self._in_table_frame(np.asarray(self._charuco().getChessboardCorners()))
 
-    def markers_m(self) -> Float[np.ndarray, "M 4 2"]:
+    def markers_m(self) -> Quads:
         """Return the corners of the markers by number, clockwise from the top left, in the table frame [m]."""
         return self._in_table_frame(np.asarray(self._charuco().getObjPoints()))
 
@@ -531,7 +531,7 @@ def board_view(found: FoundPoints, size: tuple[int, int], intrinsics: Intrinsics
         focal, deviation = focal_length(found.points_m, found.points_px, size, ACCURACY_PX * scale)
         K = camera_matrix(focal, size[0] / 2, size[1] / 2)
     else:
-        K, deviation = _checked_intrinsics(intrinsics), 0.0
+        K, deviation = checked_intrinsics(intrinsics, "intrinsics"), 0.0
     pose, rms = planar_pose(found.points_m, found.points_px, K)
     if rms > _MAX_RMS_PX * scale:
         raise InvalidInput(
@@ -575,7 +575,7 @@ def _board_points(grey: Grey, board: Board) -> FoundPoints:
     return found
 
 
-def _moved(plane: Float[np.ndarray, "M 4 2"], corners: Float[np.ndarray, "M 4 2"], found: FoundPoints) -> bool:
+def _moved(plane: Quads, corners: Quads, found: FoundPoints) -> bool:
     """Return whether markers lie elsewhere on the board: another layout's first squares look alike at a wrong scale."""
     homography, _ = cv2.findHomography(found.points_m, found.points_px)
     distances = np.abs(transform(homography, plane) - corners).max(axis=(1, 2))
@@ -583,7 +583,7 @@ def _moved(plane: Float[np.ndarray, "M 4 2"], corners: Float[np.ndarray, "M 4 2"
     return len(corners) - in_place > max(_STRAY_MARKERS, in_place / 3)
 
 
-def _continued(board: Board, corners: Float[np.ndarray, "M 4 2"], found: FoundPoints) -> bool:
+def _continued(board: Board, corners: Quads, found: FoundPoints) -> bool:
     """Return whether markers that this board lacks continue its squares: it has more rows."""
     homography, _ = cv2.findHomography(found.points_px, found.points_m)
     corners = transform(homography, corners)
@@ -592,13 +592,6 @@ def _continued(board: Board, corners: Float[np.ndarray, "M 4 2"], found: FoundPo
     continue_it = np.all(np.abs(sides / board.marker_m - 1) < _ALIKE, axis=1)
     continue_it &= np.all(np.abs(squares - np.round(squares)) < _ALIKE, axis=1)
     return bool(continue_it.sum() >= _STRAY_MARKERS)
-
-
-def _checked_intrinsics(intrinsics: Intrinsics) -> Float[np.ndarray, "3 3"]:
-    K = np.array(intrinsics, float)
-    if K.shape != (3, 3) or not np.all(np.isfinite(K)) or not min(K[0, 0], K[1, 1]) > 0 or np.any(K[2] != (0, 0, 1)):
-        raise InvalidInput("intrinsics", K.tolist(), "a 3 x 3 matrix with positive focal lengths and last row 0, 0, 1")
-    return K
 
 
 def _not_found(grey: Grey, corners: int) -> InvalidInput:
@@ -625,6 +618,135 @@ def _blur_px(grey: Grey) -> float:
     steepest = max(float(np.percentile(np.hypot(*slopes), 99.9)), 1e-3)
     low, high = np.percentile(smooth, (1, 99))
     return float(np.sqrt(max(((high - low) / steepest) ** 2 / (2 * np.pi) - 1, 0)))
+
+
+# Radial distortion of a lens from one photograph of the board, and photographs without it.
+#
+# x' = x (1 + k1 r^2) for points x of the plane at distance 1 before the camera, r = |x|: OpenCV's model, one
+# coefficient. Printed points are first looked for in the photograph as it is, then, with the distortion that they
+# show, in one that is free of it, and so on, since straight lines are what finds them.
+
+
+CONTRADICTED = "focal length of the photo [px]"  # `InvalidInput.what` of a given one that the board contradicts
+_LENS_ROUNDS = 3
+_SURE_STD = 0.03  # of a focal length that is sure, relative
+_MOST_FACTOR = 1.15  # by which a given focal length may differ from that
+_SURE = 3.0  # standard deviations
+_CENTRE_SHARE, _FOCAL_SHARE = 0.01, 0.01  # deviations: of the principal point from the middle, of a given focal length
+_MOST_RADIAL = 0.5  # of |k1|
+_LEAST_BEND_PX = 0.5  # of distortion in the photograph's corners
+FINE_PX = 0.015  # of points, where the lens is modelled: they scatter by 0.01 px in VGA
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lens:
+    """A camera with radial distortion.
+
+    Attributes:
+        intrinsics: 3 x 3 [px], pixel centres at +0.5.
+        radial: k1; 0 for none.
+        std: its standard deviation.
+    """
+
+    intrinsics: Intrinsics
+    radial: float
+    std: float = 0.0
+
+    def straightened(self, image: np.ndarray) -> np.ndarray:
+        """Return the same view without distortion, by the same intrinsics; beyond the photograph its edge repeats."""
+        if not self.radial:
+            return image
+        centre = self.intrinsics.copy()
+        centre[:2, 2] -= 0.5  # OpenCV counts indices
+        bend, size = np.array([self.radial, 0.0, 0.0, 0.0]), (image.shape[1], image.shape[0])
+        maps = cv2.initUndistortRectifyMap(centre, bend, np.eye(3), centre, size, cv2.CV_32FC1)
+        return cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+    def bent(self, points_px: Points) -> Points:
+        """Return where points of the straight photograph are in the one that was taken [px]."""
+        K = self.intrinsics
+        x = (points_px - K[:2, 2]) / K[[0, 1], [0, 1]]
+        return x * (1 + self.radial * (x**2).sum(axis=1, keepdims=True)) * K[[0, 1], [0, 1]] + K[:2, 2]
+
+
+def locate_board_through_lens(image: Image8, board: Board, intrinsics: Intrinsics | None) -> tuple[BoardView, Lens]:
+    """Find the camera of a photograph that shows a board, and its lens; arguments and errors as of `locate_board`.
+
+    Returns:
+        The camera of the straightened photograph, and the lens that straightens it. Its radial coefficient is 0 where
+        the board's points show none: fewer than 3 standard deviations, or half a pixel in the corners.
+    """
+    found, lens = board_points_through_lens(image, board, intrinsics)
+    size = image.shape[1], image.shape[0]
+    if intrinsics is not None:
+        _check_focal(found, size, float(intrinsics[0, 0]))
+    view = board_view(found, size, intrinsics)
+    return view, lens or Lens(view.intrinsics, 0.0)
+
+
+def board_points_through_lens(
+    image: Image8, board: Board, intrinsics: Intrinsics | None = None
+) -> tuple[FoundPoints, Lens | None]:
+    """Find the board's corners in the straightened photograph, and the lens; arguments as of `locate_board`.
+
+    Raises:
+        InvalidInput: if the image is no photograph, or no board or too little of it is found.
+    """
+    found, size = board_points(image, board), (image.shape[1], image.shape[0])
+    lens: Lens | None = None
+    for _ in range(_LENS_ROUNDS):
+        seen_px = found.points_px if lens is None else lens.bent(found.points_px)
+        fit = _fitted(found.points_m, seen_px, size, intrinsics)
+        if fit is None:
+            break
+        lens, found = fit, board_points(fit.straightened(image), board)
+    return found, lens
+
+
+def _fitted(points_m: Points, points_px: Points, size: tuple[int, int], intrinsics: Intrinsics | None) -> Lens | None:
+    """Fit a lens; None if the points are not sure of a distortion.
+
+    Pose, focal length, principal point and k1 are fitted together; a principal point beside the middle looks much like
+    distortion, so that it is left free within 1 % of the image, and a focal length that is given within 1 %.
+    """
+    accuracy, middle = FINE_PX * px_scale(size), np.array(size) / 2
+    start = fit_focal(points_m, points_px, size, accuracy)
+    if start is None:
+        return None
+    points = on_plane(points_m)
+    focal = start.focal if intrinsics is None else float(intrinsics[0, 0])
+    spread = np.array([_FOCAL_SHARE if intrinsics is not None else 1.0, *[_CENTRE_SHARE * max(size)] * 2, 1.0])
+
+    def matrix(p: Float[np.ndarray, "10"]) -> Intrinsics:
+        return camera_matrix(focal * np.exp(p[6]), *(middle + p[7:9]))
+
+    def residuals(p: Float[np.ndarray, "10"]) -> Float[np.ndarray, "M"]:
+        bend = np.array([p[9], 0.0, 0.0, 0.0])
+        at = cv2.projectPoints(points, p[:3], p[3:6], matrix(p), bend)[0].reshape(-1, 2)
+        return np.concatenate([(at - points_px).ravel() / accuracy, p[6:] / spread])
+
+    first = np.concatenate([start.rotation, start.translation, [np.log(start.focal / focal)], np.zeros(3)])
+    fit = least_squares(residuals, first, x_scale="jac", method="lm")
+    scatter = max(1.0, float(np.sqrt(2 * fit.cost / max(fit.fun.size - first.size, 1))))
+    std = scatter * float(np.sqrt(np.linalg.pinv(fit.jac.T @ fit.jac)[-1, -1]))
+    K, radial = matrix(fit.x), float(fit.x[9])
+    reach = np.hypot(*size) / 2 / K[0, 0]  # of the corners from the middle, at distance 1
+    if not (_SURE * std < abs(radial) < _MOST_RADIAL and abs(radial) * reach**3 * K[0, 0] > _LEAST_BEND_PX):
+        return None
+    return Lens(K, radial, std)
+
+
+def _check_focal(found: FoundPoints, size: tuple[int, int], given: float) -> None:
+    """Refuse a focal length that the board contradicts."""
+    free = fit_focal(found.points_m, found.points_px, size, ACCURACY_PX * px_scale(size))
+    if free is None or free.focal_std >= _SURE_STD * free.focal:
+        return
+    if not 1 / _MOST_FACTOR < given / free.focal < _MOST_FACTOR:
+        raise InvalidInput(
+            CONTRADICTED, f"given as {given:.0f} at {size[0]} x {size[1]} pixels",
+            f"about {free.focal / given:.2f} times that, as the board in it shows; "
+            "leave it out to let the board tell it",
+        )  # fmt: skip
 
 
 # The page with the calibration board, to print.

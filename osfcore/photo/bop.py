@@ -71,7 +71,6 @@ _ROWS: tuple[tuple[str, _Shift, _Shift | None], ...] = (
 )
 NAMES: tuple[str, ...] = tuple(name for name, _, _ in _ROWS)
 _SHIFTS_MM: dict[str, dict[str, _Shift]] = {
-    "bop": dict.fromkeys(NAMES, (0.0, 0.0, 0.0)),
     "ycb_video": {name: shift for name, shift, _ in _ROWS},
     "google_16k": {name: shift for name, _, shift in _ROWS if shift is not None}
     | {
@@ -167,7 +166,7 @@ MAX_BYTES = 100_000_000
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 SCENE_CAMERA, SCENE_GT = "scene_camera.json", "scene_gt.json"
 _MOST_SKEW = 0.02  # of R R^T from the identity
-_NEAR_M, _FAR_M = 0.02, 20.0  # where objects can be before a camera
+_NEAR_M, _FAR_M = 0.02, 20.0  # where objects can be before a camera, and a table's frame
 _KINDS = "a .csv of BOP, a scene_gt.json, a .mat of PoseCNN, or a .json with a position and a quaternion of each object"
 
 
@@ -242,7 +241,7 @@ def scene_gt_names(path: Path, image: int) -> tuple[str, ...]:
         CorruptFile: if it is no scene_gt.json.
         InvalidInput: if it lacks the image.
     """
-    return tuple(row.name for row in read_json(path, _gt_rows) if row.image == image)
+    return tuple(row.name for row in _image_rows(path, image))
 
 
 def result_images(path: Path) -> dict[tuple[int, int], list[str]]:
@@ -307,6 +306,11 @@ def _gt_rows(data: object) -> list[_Row]:
         for image, entries in by_image.items()
         for entry in entries
     ]
+
+
+def _image_rows(path: Path, image: int) -> list[_Row]:
+    """Read the rows of one image from a scene_gt.json, in its order."""
+    return [row for row in read_json(path, _gt_rows) if row.image == image]
 
 
 def _of_json(path: Path, choice: PoseChoice) -> dict[str, Pose]:
@@ -388,7 +392,7 @@ def _before_camera(position: np.ndarray, unit: str) -> np.ndarray:
 # whole image [s], -1 where it is not known.
 
 
-UNKNOWN_TIME = -1.0
+UNKNOWN_TIME = -1.0  # [s]
 _MOST_SCENE = 999_999
 
 
@@ -514,7 +518,6 @@ def _read(path: Path, sent: tuple[int, int], kept: tuple[int, int]) -> Bool[np.n
 
 
 _HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0.0]])
-_FARTHEST_M = 20.0
 
 
 class _CameraJson(Entry):
@@ -534,8 +537,8 @@ class _CameraJson(Entry):
             return None
         quaternion = _nearest_rotation(np.array(self.R_w2c).reshape(3, 3), f"cam_R_w2c of image {image}")
         t = 1e-3 * np.array(self.t_w2c)
-        if np.linalg.norm(t) > _FARTHEST_M:
-            raise InvalidInput(f"cam_t_w2c of image {image} [mm]", self.t_w2c, f"below {1e3 * _FARTHEST_M:g} in length")
+        if np.linalg.norm(t) > _FAR_M:
+            raise InvalidInput(f"cam_t_w2c of image {image} [mm]", self.t_w2c, f"below {1e3 * _FAR_M:g} in length")
         return Pose(t, quaternion)
 
 
@@ -600,10 +603,9 @@ def read_images(folder: Path, choice: BopChoice | None = None) -> tuple[BopImage
 
     choice = choice or BopChoice()
     entries, centres = read_json(folder / SCENE_CAMERA, parse), read_centres(choice.models)
-    return tuple(
-        _image(folder, number, entries[number], _annotated(folder, number, centres), choice.encoding)
-        for number in _chosen(choice.images, tuple(entries))
-    )
+    numbers = _chosen(choice.images, tuple(entries))
+    poses = (_annotated(folder, number, centres) for number in numbers)
+    return tuple(_image(folder, n, entries[n], its, choice.encoding) for n, its in zip(numbers, poses, strict=True))
 
 
 def _chosen(asked: tuple[int, ...] | None, there: tuple[int, ...]) -> tuple[int, ...]:
@@ -619,15 +621,14 @@ def _chosen(asked: tuple[int, ...] | None, there: tuple[int, ...]) -> tuple[int,
 
 def _annotated(folder: Path, image: int, centres: Mapping[str, np.ndarray]) -> dict[str, Pose]:
     """Read `T_camera_object` of the objects in an image, in the frame of their boxes' centres."""
-    names = scene_gt_names(folder / SCENE_GT, image)
-    if repeated := [name for name in names if names.count(name) > 1]:
-        raise InvalidInput(f"objects of image {image}", f"{repeated[0]} several times", "each there once")
-    if not names:
-        return {}
-    poses = read_poses(folder / SCENE_GT, PoseChoice(image))
-    if unknown := [name for name in names if name not in centres]:
-        raise InvalidInput(f"model of {unknown[0]}", "missing", "in models_info.json")
-    return {name: Pose(poses[name].apply(centres[name]), poses[name].quaternion) for name in names}
+    poses: dict[str, Pose] = {}
+    for row in _image_rows(folder / SCENE_GT, image):
+        if row.name in poses:
+            raise InvalidInput(f"objects of image {image}", f"{row.name} several times", "each there once")
+        if row.name not in centres:
+            raise InvalidInput(f"model of {row.name}", "missing", "in models_info.json")
+        poses[row.name] = Pose(row.pose.apply(centres[row.name]), row.pose.quaternion)
+    return poses
 
 
 def _image(folder: Path, number: int, entry: _CameraJson, poses: Mapping[str, Pose], encoding: Encoding) -> BopImage:
@@ -717,14 +718,10 @@ def read_bop_scene(
     if len({image.picture.shape for image in images}) > 1:
         raise InvalidInput("sizes of the images", "not the same", "the same; choose images of one camera")
     hidden = np.zeros(images[0].picture.shape[:2], bool)
-    observation = Observation(
-        tuple(replace(image.camera, T_world_camera=pose) for image, pose in zip(images, cameras, strict=True)),
-        np.stack([image.picture for image in images]),
-        names,
-        np.stack([[image.masks.get(name, hidden) for name in names] for image in images]),
-        None,
-        0.0,
-    )
+    placed = tuple(replace(image.camera, T_world_camera=pose) for image, pose in zip(images, cameras, strict=True))
+    pictures = np.stack([image.picture for image in images])
+    masks = np.stack([[image.masks.get(name, hidden) for name in names] for image in images])
+    observation = Observation(placed, pictures, names, masks, None, 0.0)
     return BopScene(observation, poses, tuple(name for name in there if name not in names))
 
 

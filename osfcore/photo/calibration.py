@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field, FiniteFloat
+from scipy.linalg import block_diag
 from scipy.optimize import OptimizeResult, least_squares
 
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, check_ranges, shown
@@ -20,12 +21,25 @@ from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_from_matrix,
 from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, decode, encode
-from osfcore.photo.board import ACCURACY_PX, Board, Points, camera_matrix, fit_focal, on_plane, planar_pose, px_scale
-from osfcore.photo.lens import FINE_PX, Lens, board_points_through_lens
+from osfcore.io.scene_file import rigid_pose
+from osfcore.photo.board import (
+    ACCURACY_PX,
+    FINE_PX,
+    Board,
+    Lens,
+    Points,
+    board_points_through_lens,
+    camera_matrix,
+    fit_focal,
+    on_plane,
+    planar_pose,
+    px_scale,
+)
 from osfcore.photo.read_photograph import RawPhotograph
 
 Points3 = Float[np.ndarray, "N 3"]
 Theta = Float[np.ndarray, "4"]  # log f, cx, cy [px] and k1
+Size = tuple[int, int]  # width and height [px]
 PoseVector = Float[np.ndarray, "6"]  # rotation vector [rad] and translation [m]
 ThetaMatrix = Float[np.ndarray, "4 4"]
 JointMatrix = Float[np.ndarray, "10 10"]  # over theta and a pose
@@ -45,7 +59,7 @@ class Sighting:
     """
 
     name: str
-    size: tuple[int, int]
+    size: Size
     points_m: Points
     points_px: Points
 
@@ -71,7 +85,7 @@ def sight(raw: RawPhotograph, name: str) -> Sighting:
 
 # One camera that fits the board's corners in several photographs: nonlinear least squares over camera and poses.
 #
-# The camera has square pixels and one coefficient of radial distortion, as `osfcore.photo.lens` has it. Its
+# The camera has square pixels and one coefficient of radial distortion, as `osfcore.photo.board` has it. Its
 # parameters are theta = (log f, cx, cy, k1); each photograph adds the board's pose in the camera's frame, a
 # rotation vector and a translation.
 
@@ -188,7 +202,7 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
     What the corners do not determine stays near where it began: each parameter of the camera has a prior so loose that
     it hardly moves one that they do determine (by less than 1e-6 of its value), and is not counted as information.
     """
-    points, centre, count = [on_plane(view.points_m) for view in views], theta[0], len(poses) * POSE + INTRINSICS
+    points, centre = [on_plane(view.points_m) for view in views], theta[0]
     side = max(views[0].size)
     pull = FINE_PX / np.multiply(_LOOSE, (1.0, side, side, 1.0))
 
@@ -204,13 +218,9 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
 
     def jacobian(x: Float[np.ndarray, "P"]) -> Float[np.ndarray, "M P"]:
         blocks = [by.reshape(-1, INTRINSICS + POSE) for _, by in at(x)]
-        whole, row = np.zeros((sum(map(len, blocks)) + INTRINSICS, count)), 0
-        for number, block in enumerate(blocks):
-            rows, first = slice(row, row + len(block)), INTRINSICS + POSE * number
-            whole[rows, :INTRINSICS], whole[rows, first : first + POSE] = block[:, :INTRINSICS], block[:, INTRINSICS:]
-            row += len(block)
-        whole[row:, :INTRINSICS] = np.diag(pull)
-        return whole
+        shared = np.concatenate([*(block[:, :INTRINSICS] for block in blocks), np.diag(pull)])
+        own = block_diag(*(block[:, INTRINSICS:] for block in blocks), np.zeros((INTRINSICS, 0)))
+        return np.hstack([shared, own])
 
     start = np.concatenate([theta, poses.ravel()])
     how = {"method": "lm", "x_scale": "jac", "max_nfev": _MOST_STEPS}
@@ -255,11 +265,6 @@ def about_camera(normal: JointMatrix) -> ThetaMatrix:
     return normal[:INTRINSICS, :INTRINSICS] - across @ np.linalg.solve(normal[INTRINSICS:, INTRINSICS:], across.T)
 
 
-def total(parts: Iterable[ThetaMatrix]) -> ThetaMatrix:
-    """Return the information on theta of several photographs; zeros for none."""
-    return sum(parts, np.zeros((INTRINSICS, INTRINSICS)))
-
-
 def covariance(information: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P"]:
     """Return the inverse; very large, but finite, along what is unknown."""
     scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
@@ -273,16 +278,14 @@ def workspace_grid() -> Points3:
     return np.stack(np.meshgrid(line, line, [0.0]), axis=-1).reshape(-1, 3)
 
 
-def in_picture(theta: Theta, pose: PoseVector, points: Points3, size: tuple[int, int]) -> Bool[np.ndarray, "G"]:
+def in_picture(theta: Theta, pose: PoseVector, points: Points3, size: Size) -> Bool[np.ndarray, "G"]:
     """Return which points of the board's frame a camera sees."""
     pixels = seen(theta, pose, points)[0]
     is_before = pose_of(pose).apply(points)[:, 2] > 0
     return is_before & np.all((pixels > 0) & (pixels < size), axis=1)
 
 
-def table_error(
-    theta: Theta, pose: PoseVector, spread: JointMatrix, points: Points3, size: tuple[int, int]
-) -> TableError:
+def table_error(theta: Theta, pose: PoseVector, spread: JointMatrix, points: Points3, size: Size) -> TableError:
     """Predict the errors of table points that are located by their pixels u = pi(theta, pose, X), to first order.
 
         d X = -(d pi / d X)^-1 (d pi / d (theta, pose)) d (theta, pose),   X in the table's plane
@@ -366,9 +369,7 @@ _IDEAS = (  # words; the board's tilt [rad]; place of its middle in the picture,
 )
 
 
-def best_next(
-    theta: Theta, size: tuple[int, int], distance_m: float, expected_m: Callable[[ThetaMatrix], float]
-) -> Advice | None:
+def best_next(theta: Theta, size: Size, distance_m: float, expected_m: Callable[[ThetaMatrix], float]) -> Advice | None:
     """Return the idea after which the least error is to be expected; None if the board fits in the picture in none.
 
     Args:
@@ -388,7 +389,7 @@ def best_next(
     return min((each for each in found if np.isfinite(each.mean_m)), key=lambda each: each.mean_m, default=None)
 
 
-def usual_table_view(theta: Theta, size: tuple[int, int]) -> PoseVector:
+def usual_table_view(theta: Theta, size: Size) -> PoseVector:
     """Return the table's pose 50 degrees below a camera, where the workspace just fills the picture."""
     direction, corners = np.array([0.0, -np.cos(_TABLE_ELEVATION_RAD), np.sin(_TABLE_ELEVATION_RAD)]), workspace_grid()
     pose, distance = np.zeros(6), _LEAST_TABLE_M
@@ -434,7 +435,7 @@ class Calibration:
         missing: why the photographs do not suffice, a sentence; empty where they do.
     """
 
-    size: tuple[int, int]
+    size: Size
     lens: Lens
     focal_std_px: float
     noise_px: float
@@ -467,7 +468,7 @@ def board_place(x_m: float, y_m: float, turn_deg: float) -> Pose:
 def calibrated_camera(
     views: Sequence[Sighting], table: Sighting | None = None, T_world_board: Pose = AT_ORIGIN
 ) -> Calibration:
-    """Calibrate a camera; arguments and errors as of `assess`.
+    """Calibrate a camera; arguments and errors are those of `assess`.
 
     Raises:
         OsfError: also if the photographs do not suffice.
@@ -499,7 +500,7 @@ def assess(views: Sequence[Sighting], table: Sighting | None = None, T_world_boa
     error = error_with(np.zeros((INTRINSICS, INTRINSICS)))
     distance = float(np.median(np.linalg.norm(fit.poses[:, 3:], axis=1)))
     advice = best_next(fit.theta, size, distance, lambda more: error_with(more).mean_m)
-    spread = fit.noise_px**2 * covariance(total(map(about_camera, normals)))
+    spread = fit.noise_px**2 * covariance(np.sum([about_camera(normal) for normal in normals], axis=0))
     focal_std = float(np.sqrt(spread[0, 0]))
     names = [view.name for view in every]  # many phones call each photograph image.jpg
     names = [f"{name} ({names[:k].count(name) + 1})" if name in names[:k] else name for k, name in enumerate(names)]
@@ -517,7 +518,7 @@ def assess(views: Sequence[Sighting], table: Sighting | None = None, T_world_boa
 
 
 def _error_on_table(
-    fit: CameraFit, size: tuple[int, int], normals: Sequence[JointMatrix], place: Pose | None
+    fit: CameraFit, size: Size, normals: Sequence[JointMatrix], place: Pose | None
 ) -> Callable[[ThetaMatrix], TableError]:
     """Return a function from further information on theta to the error to be expected on the table.
 
@@ -530,10 +531,10 @@ def _error_on_table(
     """
     parts = [about_camera(normal) for normal in normals]
     if place is None:
-        known, grid, pose = total(parts), workspace_grid(), usual_table_view(fit.theta, size)
+        known, grid, pose = np.sum(parts, axis=0), workspace_grid(), usual_table_view(fit.theta, size)
         last = normal_matrix(fit.theta, pose, Board().corners_m())
     else:
-        known, grid, pose = total(parts[:-1]), place.inverse().apply(workspace_grid()), fit.poses[-1]
+        known, grid, pose = np.sum(parts[:-1], axis=0), place.inverse().apply(workspace_grid()), fit.poses[-1]
         last = normals[-1]
 
     def error_with(more: ThetaMatrix) -> TableError:
@@ -572,9 +573,8 @@ def _check_photos(every: Sequence[Sighting]) -> None:
             raise CorruptFile(shown(view.name), f"{given}; take all with one camera held the same way up, uncropped")
     for one, other in itertools.combinations(every, 2):
         if len(one.points_px) == len(other.points_px) and np.abs(one.points_px - other.points_px).max() < _SAME_PX:
-            raise CorruptFile(
-                shown(other.name), f"it shows the same as {shown(one.name)}; move the board or the camera"
-            )
+            reason = f"it shows the same as {shown(one.name)}; move the board or the camera"
+            raise CorruptFile(shown(other.name), reason)
 
 
 def _check_agreement(every: Sequence[Sighting], fit: CameraFit) -> None:
@@ -588,16 +588,13 @@ def _check_agreement(every: Sequence[Sighting], fit: CameraFit) -> None:
         without = {k: fit_camera([view for n, view in enumerate(every) if n != k]).scatter_px for k in suspects}
         best = min(suspects, key=without.__getitem__)
         if _ODD_GAIN * without[best] ** 2 < fit.scatter_px**2:
-            reason = (
-                f"the board's corners in it lie {fit.rms_px[best]:.2g} px from where the other photos put them; "
-                "take it anew with the same zoom and a flat sheet, or leave it out"
-            )
-            raise CorruptFile(shown(every[best].name), reason)
+            off = f"the board's corners in it lie {fit.rms_px[best]:.2g} px from where the other photos put them"
+            what_to_do = "take it anew with the same zoom and a flat sheet, or leave it out"
+            raise CorruptFile(shown(every[best].name), f"{off}; {what_to_do}")
     if rms > MOST_RMS_PX * scale:
+        what = "mean distance of the board's corners from where one camera shows them [px]"
         allowed = f"at most {MOST_RMS_PX * scale:.1f}: take all photos with one camera and one zoom, and the sheet flat"
-        raise InvalidInput(
-            "mean distance of the board's corners from where one camera shows them [px]", round(rms, 1), allowed
-        )
+        raise InvalidInput(what, round(rms, 1), allowed)
 
 
 # camera.json: a calibrated camera as a file.
@@ -605,7 +602,7 @@ def _check_agreement(every: Sequence[Sighting], fit: CameraFit) -> None:
 #     {"name", "T_world_camera": 4x4 | null, "K": 3x3, "width", "height", "radial", "focal_std_px", "corner_std_px",
 #      "expected_error_mm": {"mean", "worst"}, "reprojection_px": {photo: rms}}
 #
-# A camera as in scene.json, of photographs without distortion; `radial` is k1 of `osfcore.photo.lens`, which
+# A camera as in scene.json, of photographs without distortion; `radial` is k1 of `osfcore.photo.board.Lens`, which
 # straightens them. Pixels are those of the photographs as they were sent.
 
 
@@ -646,11 +643,11 @@ class KnownCamera:
         T_world_camera: where it stands; None if unknown.
     """
 
-    size: tuple[int, int]
+    size: Size
     lens: Lens
     T_world_camera: Pose | None
 
-    def lens_at(self, size: tuple[int, int]) -> Lens:
+    def lens_at(self, size: Size) -> Lens:
         """Return the lens for photographs of this width and height [px].
 
         Raises:
@@ -693,20 +690,14 @@ def known_camera(data: object) -> KnownCamera:
     """
     entry = decode(CalibrationJson, data, "camera")
     check_ranges(("radial of the camera", entry.radial, -_MOST_RADIAL, _MOST_RADIAL))
-    K, side, pose = np.array(entry.K), max(entry.width, entry.height), None
+    K, side = np.array(entry.K), max(entry.width, entry.height)
     if not np.array_equal(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], (0, 0, 0, 0, 1)):
         raise InvalidInput("K of the camera", K.tolist(), "[[f, 0, x], [0, f, y], [0, 0, 1]]")
     low, high = np.multiply(_FOCAL_RANGE, side).tolist()
     for number in (0, 1):
         check_ranges(("focal length of the camera [px]", K[number, number], low, high))
         check_ranges(("principal point of the camera [px]", K[number, 2], -side, 2 * side))
-    if entry.T_world_camera is not None:
-        matrix = np.array(entry.T_world_camera)
-        R = matrix[:3, :3]
-        is_rotation = np.allclose(R @ R.T, np.eye(3), atol=1e-4) and np.linalg.det(R) >= 0
-        if not is_rotation or not np.allclose(matrix[3], (0, 0, 0, 1)):
-            raise InvalidInput("T_world_camera of the camera", matrix.tolist(), "a rotation and a translation, 4 x 4")
-        pose = Pose.from_matrix(matrix)
+    pose = None if entry.T_world_camera is None else rigid_pose(entry.T_world_camera, entry.name)
     return KnownCamera((entry.width, entry.height), Lens(K, entry.radial), pose)
 
 

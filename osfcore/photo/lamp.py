@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +23,8 @@ Vector = Float[np.ndarray, "3"]
 Vectors = Float[np.ndarray, "P 3"]
 Colours = Float[np.ndarray, "P C"]
 PerPixel = Float[np.ndarray, "P"]
+Columns = Float[np.ndarray, "P K"]
+Light, Lights = Float[np.ndarray, "K"], Float[np.ndarray, "3 K"]  # of K terms: of one colour, and of all
 
 # The direction toward a lamp, from the shading of surfaces whose normals and albedo are known.
 #
@@ -37,7 +39,8 @@ PerPixel = Float[np.ndarray, "P"]
 # n . l / 2 + ...), 0 for a sky.
 
 
-Visibility = Callable[[Vector], PerPixel]
+Visibility = Callable[[Vector], PerPixel] | None  # share of a lamp's light from a direction that reaches each pixel
+Solution = tuple[Vectors, Lights]  # residuals and light
 
 _DIRECTIONS = 600
 _SHADED = 60  # of them, the best without shadows, that are compared with them
@@ -99,15 +102,14 @@ class LampFit:
     is_diffuse: bool
 
 
-def fit_lamp(pixels: ShadedPixels, visible: Visibility | None = None) -> LampFit:
+def fit_lamp(pixels: ShadedPixels, visible: Visibility = None) -> LampFit:
     """Find the lamp.
 
     Args:
         pixels: of all objects in one photograph.
         visible: share of a lamp's light from a direction that reaches each pixel past objects; all by default.
     """
-    weights = np.ones(len(pixels.radiance))
-    grid = fibonacci_sphere(_DIRECTIONS)
+    weights, grid = np.ones(len(pixels.radiance)), fibonacci_sphere(_DIRECTIONS)
     for shadows in [None] if visible is None else [None, visible]:
         costs = [_squared(_solve(pixels, d, shadows, weights)[0], weights) for d in grid]
         grid = grid[np.argsort(costs, kind="stable")[:_SHADED]]
@@ -124,9 +126,7 @@ def fit_lamp(pixels: ShadedPixels, visible: Visibility | None = None) -> LampFit
     return LampFit(direction, std, light[:, -1], light[:, 0], gain, bool(is_diffuse))
 
 
-def _solve(
-    pixels: ShadedPixels, direction: np.ndarray | None, visible: Visibility | None, weights: np.ndarray
-) -> tuple[Vectors, Float[np.ndarray, "3 K"]]:
+def _solve(pixels: ShadedPixels, direction: Vector | None, visible: Visibility, weights: PerPixel) -> Solution:
     """Fit the light under a lamp from a direction, or without a lamp, and return the residuals and that light."""
     basis = [np.ones(len(weights)), *pixels.normals.T]
     if direction is not None:
@@ -145,9 +145,7 @@ def _solve(
     return residual, light
 
 
-def _refine(
-    pixels: ShadedPixels, start: np.ndarray, visible: Visibility | None, weights: np.ndarray
-) -> tuple[np.ndarray, float]:
+def _refine(pixels: ShadedPixels, start: Vector, visible: Visibility, weights: PerPixel) -> tuple[Vector, float]:
     """Return the direction nearby with the least weighted residual, and its standard deviation [rad]."""
     right, up = orthogonal_basis(start)
     root = np.sqrt(weights)[:, None]
@@ -277,6 +275,7 @@ def _caster(surfels: Surfels, pose: Pose) -> tuple[Float32[np.ndarray, "S 3"], F
 
 
 TABLE = -1
+Sides = tuple[float, float] | None  # along x and y [m]
 PixelColumns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # radiance, albedo, points and normals
 _MASK_SIDE, _TABLE_SIDE = 60, 320  # of masks and photographs, as they are looked at [px]
 _OBJECT_PIXELS, _TABLE_PIXELS = 600, 1800  # of one object, and of the table, in one photograph
@@ -331,52 +330,20 @@ class LitPixels:
                          self.owner[some], self.view[some], self.shadows)  # fmt: skip
 
 
-def lit_pixels(
-    photos: Sequence[Photograph],
-    poses: Mapping[str, Pose],
-    surfels: Mapping[str, Surfels],
-    *,
-    covered_m: tuple[float, float] | None = None,
-) -> LitPixels:
-    """Collect the pixels that show objects, and where the table's plane is known, the table.
-
-    Args:
-        photos: of one scene, with masks.
-        poses: of the objects in the world.
-        surfels: of each object.
-        covered_m: sides of a print that lies around the world's origin and hides the table, along x and y [m].
-
-    Raises:
-        InvalidInput: if too few pixels show anything known.
-    """
-    shadows = Shadows([surfels[name] for name in poses], list(poses.values()))
-    parts = []
-    for view, photo in enumerate(photos):
-        for owner, (name, pose) in enumerate(poses.items()):
-            if name in photo.masks:
-                parts.append((*_object_pixels(photo, name, pose, surfels[name]), owner, view))
-        if photo.on_table:
-            parts.append((*_table_pixels(photo, shadows.centre, covered_m), TABLE, view))
-    owner, view = (np.repeat([p[k] for p in parts], [len(p[0]) for p in parts]).astype(int) for k in (4, 5))
-    radiance, albedo, points, normals = _joined(parts)
-    return LitPixels(radiance, albedo, points, normals, owner, view, shadows)
-
-
 def _joined(parts: Sequence[tuple[Any, ...]]) -> list[Vectors]:
     """Concatenate the first four columns of parts: radiance, albedo, points and normals."""
     return [np.concatenate([np.zeros((0, 3)), *(part[k] for part in parts)]) for k in range(4)]
 
 
-def object_pixels(photo: Photograph, name: str, pose: Pose, surfels: Surfels) -> PixelColumns:
+def object_pixels(photo: Photograph, found: PhotoObject, surfels: Surfels) -> PixelColumns:
     """Return radiance, albedo, points in the world [m] and normals of well exposed pixels that show an object.
 
     Args:
         photo: with a mask of the object.
-        name: of the object.
-        pose: `T_world_object`.
+        found: the object and its pose in the world.
         surfels: of the object.
     """
-    window = object_windows([photo], name, _MASK_SIDE)[0]
+    window, pose = object_windows([photo], found.name, _MASK_SIDE)[0], found.best.pose
     index, _ = draw(surfels, window, pose[None])
     shown = (index[0] >= 0) & window.plain
     seen = index[0][shown]
@@ -384,30 +351,27 @@ def object_pixels(photo: Photograph, name: str, pose: Pose, surfels: Surfels) ->
     return window.image[shown], surfels.albedo[seen], points, normals
 
 
-def _object_pixels(photo: Photograph, name: str, pose: Pose, surfels: Surfels) -> PixelColumns:
+def _facing_pixels(photo: Photograph, found: PhotoObject, surfels: Surfels) -> PixelColumns:
     """Return some of `object_pixels`, none of which is seen at a grazing angle."""
     try:
-        radiance, albedo, points, normals = object_pixels(photo, name, pose, surfels)
+        columns = object_pixels(photo, found, surfels)
     except InvalidInput:  # a tiny mask in one of several views
-        nothing = np.zeros((0, 3))
-        return nothing, nothing, nothing, nothing
-    to_camera = photo.T_world_camera.position - points
-    cosine = np.sum(normals * to_camera, axis=1) / np.linalg.norm(to_camera, axis=1)
+        return (np.zeros((0, 3)),) * 4
+    to_camera = photo.T_world_camera.position - columns[2]
+    cosine = np.sum(columns[3] * to_camera, axis=1) / np.linalg.norm(to_camera, axis=1)
     kept = np.flatnonzero(cosine > _SEEN)
     kept = kept[:: max(-(-len(kept) // _OBJECT_PIXELS), 1)]
-    return radiance[kept], albedo[kept], points[kept], normals[kept]
+    radiance, albedo, points, normals = (column[kept] for column in columns)
+    return radiance, albedo, points, normals
 
 
-def _table_pixels(photo: Photograph, centre: np.ndarray, covered_m: tuple[float, float] | None) -> PixelColumns:
+def _table_pixels(photo: Photograph, centre: np.ndarray, covered_m: Sides) -> PixelColumns:
     """Return radiance, ones, points [m] and normals of well exposed pixels of the table near the objects."""
-    full, photo = photo, photo.with_masks({}).resized(_TABLE_SIDE)
-    objects = np.zeros((full.height, full.width), np.uint8)
-    for mask in full.masks.values():
-        objects |= mask.view(np.uint8)
-    whole = cv2.resize(objects.astype(np.float32), (photo.width, photo.height), interpolation=cv2.INTER_AREA)
-    covered, beside = (
-        cv2.dilate((whole > 0).astype(np.uint8), np.ones((k, k), np.uint8)) > 0 for k in (_MARGIN, _BESIDE)
-    )
+    objects = np.any([np.zeros((photo.height, photo.width), bool), *photo.masks.values()], axis=0).astype(np.float32)
+    photo = photo.with_masks({}).resized(_TABLE_SIDE)
+    whole = cv2.resize(objects, (photo.width, photo.height), interpolation=cv2.INTER_AREA)
+    some = (whole > 0).astype(np.uint8)
+    covered, beside = (cv2.dilate(some, np.ones((k, k), np.uint8)) > 0 for k in (_MARGIN, _BESIDE))
     rows, columns = np.nonzero(photo.well_exposed & ~covered)
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
     matrix = quaternion_to_matrix(photo.T_world_camera.quaternion) @ np.linalg.inv(photo.intrinsics)
@@ -577,9 +541,7 @@ def _table_light(share: PerPixel, radiance: Colours, weights: PerPixel) -> Colou
     return base + share[:, None] * slope
 
 
-def _ridge(
-    basis: np.ndarray, albedo: np.ndarray, target: np.ndarray, weights: np.ndarray, ridge: float
-) -> Float[np.ndarray, "K"]:
+def _ridge(basis: Columns, albedo: PerPixel, target: PerPixel, weights: PerPixel, ridge: float) -> Light:
     weighted = basis * (weights * albedo)[:, None]
     normal = weighted.T @ (basis * albedo[:, None])
     scale = max(float(normal[0, 0]), _TINY)
@@ -648,9 +610,7 @@ class LampSearch:
                 light = self._on_objects(chosen, None if share is None else share[chosen], weights[chosen], residual)
                 ambient[view], fitted[view] = light[:, 0], light[:, 4] if share is not None else 0.0
                 gradients.append(light[:, 1:4].mean(axis=0))
-        for chosen in self._table_by_view:
-            if not len(chosen):
-                continue
+        for chosen in filter(len, self._table_by_view):
             if share is None:
                 lit = smooth_light(self.pixels.points[chosen], radiance[chosen], weights[chosen])
             else:
@@ -658,9 +618,7 @@ class LampSearch:
             residual[chosen] = radiance[chosen] - lit
         return Gains(residual, fitted, ambient, np.mean(gradients or [np.zeros(3)], axis=0))
 
-    def _on_objects(
-        self, chosen: np.ndarray, share: np.ndarray | None, weights: np.ndarray, residual: np.ndarray
-    ) -> Float[np.ndarray, "3 K"]:
+    def _on_objects(self, chosen: np.ndarray, share: PerPixel | None, weights: PerPixel, residual: Vectors) -> Lights:
         """Fit the light of objects in one view; write the residual."""
         plain = np.column_stack([np.ones(len(chosen)), self.pixels.normals[chosen]])
         lit = plain if share is None else np.column_stack([plain, share])
@@ -726,9 +684,8 @@ class LampSearch:
 
         start = np.zeros(lamp.count)
         found = least_squares(cost, start, jacobian, method="lm", max_nfev=_EVALUATIONS)  # pyright: ignore[reportArgumentType]
-        shape = len(weights), 3
         moved = lamp.moved(found.x * steps, above_table=self.is_on_table)
-        return Refined(moved, found.fun.reshape(shape), found.jac.reshape(*shape, -1) / scale)
+        return Refined(moved, found.fun.reshape(-1, 3), found.jac.reshape(-1, 3, lamp.count) / scale)
 
     def _normalised(self) -> Float[np.ndarray, "P 1"]:
         """Return radiance, mean of the colours, such that views have about the same exposure."""
@@ -867,17 +824,12 @@ def fit_near_lamp(pixels: LitPixels, centre: Vector) -> NearLampFit:
     log_std = float(np.sqrt(covariance[2, 2] + _POSE_STD_PER_M**2)) / found.lamp.inverse
     under, without = search.gains(found.lamp, weights), search.gains(None, weights)
     gain = _gain(under.residual, without.residual, weights)
-    is_diffuse = _is_diffuse(gain, under, without, on_table=search.is_on_table)
+    if search.is_on_table:  # nothing else explains shadows on a table
+        is_lit = gain > _LEAST_TABLE_GAIN
+    else:
+        is_lit = _speaks_for_lamp(gain, without.gradient, float(np.nanmean(without.ambient)))
+    is_diffuse = not (is_lit and np.nanmax(under.lamp, initial=0.0) > 0)
     return NearLampFit(found.lamp, std, log_std, under.lamp, under.ambient, gain, is_diffuse)
-
-
-def _is_diffuse(gain: float, under: Gains, without: Gains, *, on_table: bool) -> bool:
-    """Return whether nothing speaks for a lamp, such as shadows on a table, which nothing else explains."""
-    if not np.nanmax(under.lamp, initial=0.0) > 0:
-        return True
-    if on_table:
-        return gain <= _LEAST_TABLE_GAIN
-    return not _speaks_for_lamp(gain, without.gradient, float(np.nanmean(without.ambient)))
 
 
 def _start(pixels: LitPixels, centre: Vector) -> LampShape:
@@ -937,27 +889,18 @@ def photo_light(photo: Photograph, objects: Sequence[PhotoObject], surfels: Sequ
     Raises:
         InvalidInput: if too few pixels show objects that are trusted.
     """
-    seen = [
-        object_pixels(photo, found.name, found.best.pose, its)
-        for found, its in zip(objects, surfels, strict=True)
-        if found.name in photo.masks
-    ]
+    pairs = zip(objects, surfels, strict=True)
+    seen = [object_pixels(photo, found, its) for found, its in pairs if found.name in photo.masks]
     radiance, albedo, points, normals = _joined(seen)
     shadows = Shadows(surfels, [found.best.pose for found in objects])
     lifted = shadows.lifted(points, normals)
-
-    def visible(direction: Vector) -> PerPixel:
-        return shadows.from_direction(direction, lifted)
-
-    return fit_lamp(ShadedPixels(radiance, albedo, normals), visible)
+    return fit_lamp(
+        ShadedPixels(radiance, albedo, normals), lambda direction: shadows.from_direction(direction, lifted)
+    )
 
 
 def photo_lamp(
-    photos: Sequence[Photograph],
-    objects: Sequence[PhotoObject],
-    surfels: Sequence[Surfels],
-    *,
-    covered_m: tuple[float, float] | None = None,
+    photos: Sequence[Photograph], objects: Sequence[PhotoObject], surfels: Sequence[Surfels], *, covered_m: Sides = None
 ) -> NearLampFit:
     """Find the lamp and its place, from objects, the shadows that they cast and the table where that is known.
 
@@ -972,7 +915,13 @@ def photo_lamp(
     Raises:
         InvalidInput: if too few pixels show anything known.
     """
-    poses = {found.name: found.best.pose for found in objects}
-    known = dict(zip(poses, surfels, strict=True))
-    pixels = lit_pixels(photos, poses, known, covered_m=covered_m)
-    return fit_near_lamp(pixels, np.zeros(3) if all(p.on_table for p in photos) else pixels.shadows.centre)
+    shadows, parts = Shadows(surfels, [found.best.pose for found in objects]), []
+    for view, photo in enumerate(photos):
+        for owner, (found, its) in enumerate(zip(objects, surfels, strict=True)):
+            if found.name in photo.masks:
+                parts.append((*_facing_pixels(photo, found, its), owner, view))
+        if photo.on_table:
+            parts.append((*_table_pixels(photo, shadows.centre, covered_m), TABLE, view))
+    owner, view = (np.repeat([p[k] for p in parts], [len(p[0]) for p in parts]).astype(int) for k in (4, 5))
+    pixels = LitPixels(*_joined(parts), owner, view, shadows)
+    return fit_near_lamp(pixels, np.zeros(3) if all(p.on_table for p in photos) else shadows.centre)

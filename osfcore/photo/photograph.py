@@ -7,10 +7,52 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float32, Shaped
 
 from osfcore.errors import InvalidInput, shown
 from osfcore.geometry.poses import Pose
+from osfcore.photo.board import Intrinsics, checked_intrinsics
+
+
+@dataclass(frozen=True, slots=True)
+class WindowFrame:
+    """Which part of a photograph a window shows, and its size; it may reach beyond the photograph.
+
+    Attributes:
+        left, top, right, bottom: of the part, the last two not included [px of the photograph].
+        width, height: of the window [px].
+    """
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    width: int
+    height: int
+
+    def cut(self, array: Shaped[np.ndarray, "h w *colours"], outside: float = 0.0) -> Shaped[np.ndarray, "*window"]:
+        """Return that part of an image, averaged over areas; `outside` beyond the photograph."""
+        high, wide = array.shape[:2]
+        inner = array[max(self.top, 0) : self.bottom, max(self.left, 0) : self.right]
+        border = max(-self.top, 0), max(self.bottom - high, 0), max(-self.left, 0), max(self.right - wide, 0)
+        whole = cv2.copyMakeBorder(inner, *border, cv2.BORDER_CONSTANT, value=(outside,) * 4)
+        return cv2.resize(whole, (self.width, self.height), interpolation=cv2.INTER_AREA)
+
+    def intrinsics(self, photo: Intrinsics) -> Intrinsics:
+        """Return K of the window's camera, from the photograph's [px]."""
+        moved = photo.copy()
+        moved[:2, 2] -= self.left, self.top
+        scale = [[self.width / (self.right - self.left)], [self.height / (self.bottom - self.top)], [1.0]]
+        return moved * np.array(scale)
+
+    def placed(self, share: Float32[np.ndarray, "a b"], shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
+        """Return which pixels of the whole photograph more than half of a window's pixels there mark."""
+        whole = cv2.resize(share, (self.right - self.left, self.bottom - self.top)) > 0.5
+        top, left = max(self.top, 0), max(self.left, 0)
+        bottom, right = min(self.bottom, shape[0]), min(self.right, shape[1])
+        placed = np.zeros(shape, bool)
+        placed[top:bottom, left:right] = whole[top - self.top : bottom - self.top, left - self.left : right - self.left]
+        return placed
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -28,22 +70,24 @@ class Photograph:
 
     image: Float32[np.ndarray, "h w 3"]
     well_exposed: Bool[np.ndarray, "h w"]
-    intrinsics: Float[np.ndarray, "3 3"]
+    intrinsics: Intrinsics
     T_world_camera: Pose
     on_table: bool
     masks: Mapping[str, Bool[np.ndarray, "h w"]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and numbers."""
-        _check_image(self.image)
+        image = self.image
+        if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype != np.float32:
+            given = f"an array of {image.dtype} of shape {image.shape}"
+            raise InvalidInput("image of the photo", given, "float32, of shape (height, width, 3)")
+        if not (image.min() >= 0 and image.max() <= 1):  # also false for NaN
+            given = f"between {image.min():g} and {image.max():g}"
+            raise InvalidInput("radiance of the photo", given, "finite and between 0 and 1")
         if self.well_exposed.shape != self.image.shape[:2] or self.well_exposed.dtype != bool:
             given = f"an array of {self.well_exposed.dtype} of shape {self.well_exposed.shape}"
             raise InvalidInput("exposure mask of the photo", given, f"boolean, of shape {self.image.shape[:2]}")
-        K = self.intrinsics
-        is_sane = K.shape == (3, 3) and np.all(np.isfinite(K)) and K[0, 0] > 0 and K[1, 1] > 0
-        if not is_sane or not np.array_equal(K[2], (0, 0, 1)):
-            allowed = "a 3 x 3 matrix with positive focal lengths and last row 0, 0, 1"
-            raise InvalidInput("K of the photo's camera", K.tolist(), allowed)
+        checked_intrinsics(self.intrinsics, "K of the photo's camera")
         pose = self.T_world_camera
         if pose.position.shape != (3,) or not np.all(np.isfinite(pose.matrix())):
             raise InvalidInput("pose of the photo's camera", pose.position.tolist(), "one pose of finite numbers")
@@ -105,15 +149,6 @@ class Photograph:
 
 def _averaged(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h w *c"]:
     return cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA).astype(np.float32)
-
-
-def _check_image(image: np.ndarray) -> None:
-    if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype != np.float32:
-        given = f"an array of {image.dtype} of shape {image.shape}"
-        raise InvalidInput("image of the photo", given, "float32, of shape (height, width, 3)")
-    if not (image.min() >= 0 and image.max() <= 1):  # also false for NaN
-        given = f"between {image.min():g} and {image.max():g}"
-        raise InvalidInput("radiance of the photo", given, "finite and between 0 and 1")
 
 
 def _check_mask(name: str, mask: np.ndarray, shape: tuple[int, int]) -> None:

@@ -28,7 +28,7 @@ from osfcore.geometry.poses import (
     quaternion_to_matrix,
     rotate,
 )
-from osfcore.photo.photograph import Photograph
+from osfcore.photo.photograph import Photograph, WindowFrame
 
 # Compiled comparison of an object's surfels in many poses with one photograph.
 
@@ -36,8 +36,8 @@ from osfcore.photo.photograph import Photograph
 # ruff: noqa: ANN001, D417 - compiled code; types are given by its caller
 
 
-NOTHING = -1
-TERMS = 4  # of what `compare_poses` writes: IoU, relative residual, correlation, share of the mask that was compared
+_NOTHING = -1
+_TERMS = 4  # of what `compare_poses` writes: IoU, relative residual, correlation, share of the mask that was compared
 _LIGHTS = 4  # ambient and first-order harmonics
 _NEAREST_M = np.float32(0.02)
 _OPTIONS = {"fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
@@ -73,7 +73,7 @@ def draw_surfels(points, normals, half, r, t, lens, nearest, index) -> None:
     """
     height, width = index.shape
     nearest[:] = np.float32(1e9)
-    index[:] = NOTHING
+    index[:] = _NOTHING
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     for s in range(len(points)):
         px, py, pz = points[s, 0], points[s, 1], points[s, 2]
@@ -361,47 +361,6 @@ _MARGIN = 0.4  # of the mask's longest side, on each side
 _MIN_PIXELS = 30  # of a mask in the photograph
 
 
-@dataclass(frozen=True, slots=True)
-class WindowFrame:
-    """Which part of a photograph a window shows, and its size; it may reach beyond the photograph.
-
-    Attributes:
-        left, top, right, bottom: of the part, the last two not included [px of the photograph].
-        width, height: of the window [px].
-    """
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-    width: int
-    height: int
-
-    def cut(self, array: Float32[np.ndarray, "h w *colours"], outside: float = 0.0) -> Float32[np.ndarray, "*window"]:
-        """Return that part of an image, averaged over areas; `outside` beyond the photograph."""
-        high, wide = array.shape[:2]
-        inner = array[max(self.top, 0) : self.bottom, max(self.left, 0) : self.right]
-        border = max(-self.top, 0), max(self.bottom - high, 0), max(-self.left, 0), max(self.right - wide, 0)
-        whole = cv2.copyMakeBorder(inner, *border, cv2.BORDER_CONSTANT, value=(outside,) * 4)
-        return cv2.resize(whole, (self.width, self.height), interpolation=cv2.INTER_AREA)
-
-    def intrinsics(self, photo: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-        """Return K of the window's camera, from the photograph's [px]."""
-        moved = photo.copy()
-        moved[:2, 2] -= self.left, self.top
-        scale = [[self.width / (self.right - self.left)], [self.height / (self.bottom - self.top)], [1.0]]
-        return moved * np.array(scale)
-
-    def placed(self, drawn: Bool[np.ndarray, "a b"], shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
-        """Return a window's pixels in the whole photograph: the inverse of `cut`."""
-        whole = cv2.resize(drawn.astype(np.float32), (self.right - self.left, self.bottom - self.top)) > 0.5
-        top, left = max(self.top, 0), max(self.left, 0)
-        bottom, right = min(self.bottom, shape[0]), min(self.right, shape[1])
-        placed = np.zeros(shape, bool)
-        placed[top:bottom, left:right] = whole[top - self.top : bottom - self.top, left - self.left : right - self.left]
-        return placed
-
-
 @dataclass(frozen=True, eq=False, slots=True)
 class ObjectWindow:
     """A window of a photograph.
@@ -471,29 +430,26 @@ def _window(photo: Photograph, name: str, side: int) -> ObjectWindow:
     if mask.sum() < _MIN_PIXELS:
         allowed = f"{_MIN_PIXELS} pixels or more; come closer or take a larger photo"
         raise InvalidInput(f"size of the mask of {name}", f"{int(mask.sum())} pixels", allowed)
-    others = np.zeros_like(mask)
-    for other, its in photo.masks.items():
-        if other != name:
-            others |= its
+    others = np.any([np.zeros_like(mask), *(its for other, its in photo.masks.items() if other != name)], axis=0)
     frame = _frame(mask, side)
     own = frame.cut(mask.astype(np.float32)) > 0.5
     hidden = frame.cut((others & ~mask).astype(np.float32)) > 0.5
     beyond = frame.cut(np.zeros(mask.shape, np.float32), 1.0) > 0.5
     exposed = frame.cut(photo.well_exposed.astype(np.float32)) > 0.99
-    core = cv2.erode(own.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     image = np.ascontiguousarray(frame.cut(photo.image), np.float32)
-    return ObjectWindow(
-        image,
-        image.mean(axis=-1),
-        own,
-        ~(hidden | beyond),
-        core & exposed,
-        signed_distance(own),
-        frame.intrinsics(photo.intrinsics),
-        photo.T_world_camera.inverse(),
-        _share_cut(mask),
-        frame,
+    at_edge = int(mask[[0, -1]].sum() + mask[:, [0, -1]].sum())
+    border = int((mask & ~_eroded(mask)).sum())
+    camera, cut = (
+        (frame.intrinsics(photo.intrinsics), photo.T_world_camera.inverse()),
+        at_edge / max(border + at_edge, 1),
     )
+    known, plain = ~(hidden | beyond), _eroded(own) & exposed
+    return ObjectWindow(image, image.mean(axis=-1), own, known, plain, signed_distance(own), *camera, cut, frame)
+
+
+def _eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return a mask without the pixels at its border."""
+    return cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _frame(mask: Bool[np.ndarray, "h w"], side: int) -> WindowFrame:
@@ -505,12 +461,6 @@ def _frame(mask: Bool[np.ndarray, "h w"], side: int) -> WindowFrame:
     scale = min(1.0, side / longest)
     width, height = max(round((right - left) * scale), 1), max(round((bottom - top) * scale), 1)
     return WindowFrame(left, top, right, bottom, width, height)
-
-
-def _share_cut(mask: Bool[np.ndarray, "h w"]) -> float:
-    at_edge = int(mask[[0, -1]].sum() + mask[:, [0, -1]].sum())
-    border = int((mask & ~(cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)).sum())
-    return at_edge / max(border + at_edge, 1)
 
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
@@ -570,14 +520,9 @@ class TablePrior:
         down = self.downs(pose)
         nearest = down[np.argmax(down @ _DOWN)]
         if np.arccos(np.clip(nearest @ _DOWN, -1, 1)) < _FARTHEST * _TILT_STD_RAD:
-            for axis in range(2):  # a turn by nearest x down brings it there
-                row = np.zeros(6)
-                row[3 + axis] = 1 / _TILT_STD_RAD
-                rows.append(row)
-                residuals.append(-np.cross(nearest, _DOWN)[axis] / _TILT_STD_RAD)
-        if not rows:
-            return np.zeros((6, 6)), np.zeros(6)
-        jacobian = np.array(rows)
+            rows.extend(np.eye(6)[3:5] / _TILT_STD_RAD)  # a turn by nearest x down brings it there
+            residuals.extend(-np.cross(nearest, _DOWN)[:2] / _TILT_STD_RAD)
+        jacobian = np.reshape(rows, (-1, 6))
         return jacobian.T @ jacobian, -jacobian.T @ np.array(residuals)
 
 
@@ -593,6 +538,7 @@ class TablePrior:
 
 
 LossKind = Literal["all", "iou"]
+Indices, Depths = Int32[np.ndarray, "B h w"], Float32[np.ndarray, "B h w"]
 _RESIDUAL, _CORRELATION, _TABLE = 1.0, 0.5, 1e-3  # weights
 _LEAST_COMPARED = 0.3  # of the mask's plain pixels must be drawn for colours to count
 _HALF_SIDE = 0.7  # of a surfel, in spacings
@@ -615,25 +561,21 @@ class PoseTerms:
     losses: Float[np.ndarray, "B"]
 
 
+@dataclass(frozen=True, eq=False, slots=True)
 class PoseLoss:
     """The loss of one object's poses in the world.
 
-    Args:
+    Attributes:
         windows: of the photographs.
         surfels: of the object.
         table: prior of the known table; None where it is not known.
         kind: "all", or "iou" for the outline alone, as in the paper.
     """
 
-    def __init__(
-        self,
-        windows: Sequence[ObjectWindow],
-        surfels: Surfels,
-        *,
-        table: TablePrior | None = None,
-        kind: LossKind = "all",
-    ) -> None:
-        self.windows, self.surfels, self.table, self.kind = tuple(windows), surfels, table, kind
+    windows: tuple[ObjectWindow, ...]
+    surfels: Surfels
+    table: TablePrior | None = None
+    kind: LossKind = "all"
 
     def __call__(self, poses: Pose) -> Float[np.ndarray, "B"]:
         """Compute the losses of B poses."""
@@ -652,23 +594,13 @@ class PoseLoss:
         return PoseTerms(found[:, 0], residual, correlation, losses)
 
 
-def draw(
-    surfels: Surfels, window: ObjectWindow, poses: Pose
-) -> tuple[Int32[np.ndarray, "B h w"], Float32[np.ndarray, "B h w"]]:
-    """Draw which surfel each pixel of a window shows, -1 for none, and its depth along z [m]."""
-    local = window.T_camera_world @ poses
+def draw(surfels: Surfels, window: ObjectWindow, poses: Pose) -> tuple[Indices, Depths]:
+    """Draw which surfel each pixel of a window shows in B poses, -1 for none, and its depth along z [m]."""
     index = np.empty((len(poses.position), *window.size), np.int32)
     depth = np.empty(index.shape, np.float32)
+    camera = *rotation_and_position(window.T_camera_world @ poses), lens(window.intrinsics)
     with ONE_AT_A_TIME:
-        draw_poses(
-            surfels.points,
-            surfels.normals,
-            _half(surfels),
-            *rotation_and_position(local),
-            lens(window.intrinsics),
-            depth,
-            index,
-        )
+        draw_poses(surfels.points, surfels.normals, _half(surfels), *camera, depth, index)
     return index, depth
 
 
@@ -678,12 +610,12 @@ def lens(intrinsics: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "4"]:
 
 
 def _compare(surfels: Surfels, window: ObjectWindow, poses: Pose) -> Float[np.ndarray, "B 4"]:
-    terms = np.empty((len(poses.position), TERMS))
+    terms = np.empty((len(poses.position), _TERMS))
     mask, known, plain = (np.ascontiguousarray(a).view(np.uint8) for a in (window.mask, window.known, window.plain))
-    rotations, positions = rotation_and_position(window.T_camera_world @ poses)
+    points, camera = (surfels.points, surfels.normals, surfels.albedo, _half(surfels)), lens(window.intrinsics)
+    local, images = rotation_and_position(window.T_camera_world @ poses), (window.image, window.luminance)
     with ONE_AT_A_TIME:
-        compare_poses(surfels.points, surfels.normals, surfels.albedo, _half(surfels), rotations, positions,
-                      lens(window.intrinsics), window.image, window.luminance, mask, known, plain, terms)  # fmt: skip
+        compare_poses(*points, *local, camera, *images, mask, known, plain, terms)
     return terms
 
 

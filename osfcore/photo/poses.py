@@ -39,6 +39,9 @@ from osfcore.photo.pose_loss import (
 from osfcore.progress import Progress
 
 Pair = tuple[np.ndarray, np.ndarray]
+Photos = Sequence[Photograph]
+Rng = np.random.Generator
+Losses = Float[np.ndarray, "K"]
 
 # Gauss-Newton on the pose of one object: direct image alignment of its visible surfels, and its outline on the
 # mask's.
@@ -130,21 +133,17 @@ def _gradient(image: np.ndarray) -> Pair:
 
 
 def _normal_equations(prepared: list[_Prepared], loss: PoseLoss, pose: Pose) -> Pair:
-    normal, right = np.zeros((6, 6)), np.zeros(6)
+    terms, std_px = [], _BORDER_STD_PX if loss.table is None else _BORDER_STD_ON_TABLE_PX
     for part in prepared:
         index, _ = draw(loss.surfels, part.window, pose[None])
-        std = _BORDER_STD_PX if loss.table is None else _BORDER_STD_ON_TABLE_PX
-        terms = [_outline_terms(part, loss.surfels, pose, index[0], std)]
+        terms.append(_outline_terms(part, loss.surfels, pose, index[0], std_px))
         if loss.kind == "all":
             terms.append(_colour_terms(part, loss.surfels, pose, index[0]))
-        for more_normal, more_right in terms:
-            normal += _CORRELATED * more_normal
-            right += _CORRELATED * more_right
-    if loss.table is not None:
-        more_normal, more_right = loss.table.normal_equations(pose)
-        normal += more_normal
-        right += more_right
-    return normal, right
+    normal, right = (np.sum([_CORRELATED * term[k] for term in terms], axis=0) for k in (0, 1))
+    if loss.table is None:
+        return normal, right
+    more_normal, more_right = loss.table.normal_equations(pose)
+    return normal + more_normal, right + more_right
 
 
 def _colour_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray) -> Pair:
@@ -236,6 +235,7 @@ _CENTRING_ROUNDS = 3
 _MOST_CHANGE = 0.6  # of depth in one round
 _PSI = 1.533751168755204288118041413  # the positive root of psi^4 = psi + 4
 _LATERAL_PX, _DEPTH_SHARE, _TURN_RAD = 2.0, 0.03, 0.15  # CMA's first spread
+_GENERATIONS, _POPULATION = 14, 14
 _AROUND_LATERAL_M, _AROUND_DEPTH_SHARE, _AROUND_TURN_RAD = 0.015, 0.04, 0.25
 
 
@@ -300,7 +300,7 @@ def moved(poses: Pose, window: ObjectWindow, steps: Float[np.ndarray, "B 6"]) ->
     return Pose(poses.position + rotate(camera.quaternion, steps[:, :3]), quaternions)
 
 
-def distinct(poses: Pose, losses: Float[np.ndarray, "K"], count: int, least_deg: float) -> list[int]:
+def distinct(poses: Pose, losses: Losses, count: int, least_deg: float) -> list[int]:
     """Return the numbers of the best poses whose rotations differ from those of better ones by `least_deg` or more."""
     kept: list[int] = []
     for k in np.argsort(losses):
@@ -311,16 +311,12 @@ def distinct(poses: Pose, losses: Float[np.ndarray, "K"], count: int, least_deg:
     return kept
 
 
-def cma_search(
-    loss: PoseLoss, starts: Pose, *, generations: int, population: int, spread: float, rng: np.random.Generator
-) -> tuple[Pose, Float[np.ndarray, "K"]]:
+def cma_search(loss: PoseLoss, starts: Pose, spread: float, rng: np.random.Generator) -> tuple[Pose, Losses]:
     """Run one CMA-ES from each start; a generation of all is drawn as one batch.
 
     Args:
         loss: what is minimised.
         starts: K poses.
-        generations: of each search.
-        population: of each search.
         spread: first standard deviation, as a multiple of 2 pixels sideways, 3 % of the depth and 0.15 rad.
         rng: of the searches.
 
@@ -330,21 +326,20 @@ def cma_search(
     window = max(loss.windows, key=lambda w: int(w.mask.sum()))
     depths = (window.T_camera_world @ starts).position[:, 2]
     lateral = _LATERAL_PX * depths / window.intrinsics[0, 0]
-    scales = spread * np.stack(
-        [lateral, lateral, _DEPTH_SHARE * depths, *[np.full(len(depths), _TURN_RAD)] * 3], axis=1
-    )
-    searches = [CMAES(np.ones(6), population, rng) for _ in depths]
+    turns = [np.full(len(depths), _TURN_RAD)] * 3
+    scales = spread * np.stack([lateral, lateral, _DEPTH_SHARE * depths, *turns], axis=1)
+    searches = [CMAES(np.ones(6), _POPULATION, rng) for _ in depths]
     position, quaternion = starts.position.copy(), starts.quaternion.copy()
     least = loss(starts)
-    for _ in range(generations):
+    for _ in range(_GENERATIONS):
         asked = [search.ask() for search in searches]
         tried = Pose.joined(*(moved(starts[k], window, a * scales[k]) for k, a in enumerate(asked)))
-        losses = loss(tried).reshape(len(searches), population)
+        losses = loss(tried).reshape(len(searches), _POPULATION)
         for k, search in enumerate(searches):
             search.tell(losses[k])
             best = int(np.argmin(losses[k]))
             if losses[k, best] < least[k]:
-                least[k], number = losses[k, best], k * population + best
+                least[k], number = losses[k, best], k * _POPULATION + best
                 position[k], quaternion[k] = tried.position[number], tried.quaternion[number]
     return Pose(position, quaternion), least
 
@@ -585,7 +580,8 @@ def without_others(
                 continue
             window = object_windows([photo], other.name, _SIDE)[0]
             index, _ = draw(surfels[other.name], window, other.best.pose[None])
-            drawn = window.frame.placed(index[0] >= 0, masks[name].shape)  # as far as its window reaches
+            shown = (index[0] >= 0).astype(np.float32)
+            drawn = window.frame.placed(shown, masks[name].shape)  # as far as its window reaches
             if fits_outline(other.best):
                 masks[name] = masks[name] & ~(drawn & masks[other.name])
             masks[other.name] = masks[other.name] | drawn
@@ -609,7 +605,6 @@ _AROUND = 400
 _RANKED, _ALIKE_DEG = 40, 12.0
 _KEPT, _APART_DEG = 8, 15.0
 _NEAR_DEG = 6.0  # between candidates around a given pose
-_GENERATIONS, _POPULATION = 14, 14
 _ALIGNED = 4
 
 
@@ -666,11 +661,7 @@ class PhotoModels:
 
 
 def estimate_photo(
-    models: PhotoModels,
-    photos: Sequence[Photograph],
-    names: Sequence[str],
-    rng: np.random.Generator,
-    config: PhotoConfig | None = None,
+    models: PhotoModels, photos: Photos, names: Sequence[str], rng: Rng, config: PhotoConfig | None = None
 ) -> Iterator[PhotoStep]:
     """Find objects one after the other; the last step holds all.
 
@@ -707,21 +698,14 @@ def estimate_photo(
     if not on_table[0]:
         table = table_from_objects([models.table_prior(name) for name in names], [o.best.pose for o in found])
         if table is not None:
-            lying = set(table.supported)
-            found = [
-                _on_table(models, seen[o.name][0], o, table, config) if k in lying else o for k, o in enumerate(found)
-            ]
+            for k in table.supported:
+                found[k] = _on_table(models, seen[found[k].name][0], found[k], table, config)
     yield PhotoStep(Progress(total, total, "All objects were looked for"), tuple(found), table)
 
 
 def _found_behind(
-    models: PhotoModels,
-    photos: Sequence[Photograph],
-    found: Sequence[PhotoObject],
-    number: int,
-    rng: np.random.Generator,
-    config: PhotoConfig,
-) -> tuple[PhotoObject, Sequence[Photograph]]:
+    models: PhotoModels, photos: Photos, found: Sequence[PhotoObject], number: int, rng: Rng, config: PhotoConfig
+) -> tuple[PhotoObject, Photos]:
     """Look for an object in masks without the others; return these too, or all as before if it fits no better."""
     before = found[number]
     surfels = {other.name: models.surfels(other.name, FINE_ACROSS) for other in found}
@@ -737,17 +721,10 @@ def _on_table(
     models: PhotoModels, photo: Photograph, found: PhotoObject, table: TableGuess, config: PhotoConfig
 ) -> PhotoObject:
     """Align an object once more, now that it is known to lie on a table; its pose stays in the camera's frame."""
-    start = time.perf_counter()
-    seen = replace(photo, T_world_camera=table.T_world_camera, on_table=True)
-    sharp, plain = (
-        PoseLoss(
-            object_windows([shown], found.name, side),
-            models.surfels(found.name, FINE_ACROSS),
-            table=prior,
-            kind=config.loss,
-        )
-        for shown, side, prior in ((seen, _SHARP_SIDE, models.table_prior(found.name)), (photo, _FINE_SIDE, None))
-    )
+    start, surfels = time.perf_counter(), models.surfels(found.name, FINE_ACROSS)
+    seen = object_windows([replace(photo, T_world_camera=table.T_world_camera, on_table=True)], found.name, _SHARP_SIDE)
+    sharp = PoseLoss(seen, surfels, models.table_prior(found.name), config.loss)
+    plain = PoseLoss(object_windows([photo], found.name, _FINE_SIDE), surfels, kind=config.loss)
     pose = table.T_world_camera.inverse() @ align(sharp, table.T_world_camera @ found.best.pose)[0]
     best = _photo_poses(pose[None], plain)[0]
     doubt = doubt_of(found.name, best, found.rivals, plain)
@@ -761,14 +738,12 @@ def _photo_poses(poses: Pose, loss: PoseLoss) -> list[PhotoPose]:
     return [PhotoPose(poses[k], *(float(v) for v in values)) for k, values in enumerate(parts)]
 
 
-def find_object(
-    models: PhotoModels, photos: Sequence[Photograph], name: str, rng: np.random.Generator, config: PhotoConfig
-) -> PhotoObject:
+def find_object(models: PhotoModels, photos: Photos, name: str, rng: Rng, config: PhotoConfig) -> PhotoObject:
     """Look for one object in its masks; arguments as of `estimate_photo`."""
     on_table = all(photo.on_table for photo in photos)
     table = models.table_prior(name) if on_table else None
     coarse, fine, sharp = (
-        PoseLoss(object_windows(photos, name, side), models.surfels(name, across), table=table, kind=config.loss)
+        PoseLoss(object_windows(photos, name, side), models.surfels(name, across), table, config.loss)
         for side, across in ((_COARSE_SIDE, COARSE_ACROSS), (_FINE_SIDE, FINE_ACROSS), (_SHARP_SIDE, FINE_ACROSS))
     )
     start = time.perf_counter()
@@ -778,20 +753,11 @@ def find_object(
     else:
         candidates, alike = poses_around(given, coarse.windows[0], _AROUND, rng), _NEAR_DEG
     ranked = candidates[distinct(candidates, coarse(candidates), _RANKED if given is None else _KEPT, alike)]
-    poses, losses = cma_search(coarse, ranked, generations=_GENERATIONS, population=_POPULATION, spread=1.0, rng=rng)
+    poses, losses = cma_search(coarse, ranked, 1.0, rng)
     poses = poses[distinct(poses, losses, _KEPT, _APART_DEG if given is None else _NEAR_DEG)]
     middle = time.perf_counter()
-    poses, losses = cma_search(
-        fine,
-        poses[np.arange(min(len(poses.position), _ALIGNED))],
-        generations=_GENERATIONS,
-        population=_POPULATION,
-        spread=0.35,
-        rng=rng,
-    )
-    poses = poses[distinct(poses, losses, _ALIGNED, _NEAR_DEG)]
-    ends = [align(sharp, poses[k])[0] for k in range(len(poses.position))]
-    poses = Pose.stacked(ends)
+    poses, losses = cma_search(fine, poses[:_ALIGNED], 0.35, rng)
+    poses = Pose.stacked(align(sharp, poses[k])[0] for k in distinct(poses, losses, _ALIGNED, _NEAR_DEG))
     ready = _photo_poses(poses, fine)
     best, *rivals = (ready[k] for k in distinct(poses, np.array([p.loss for p in ready]), _ALIGNED, _APART_DEG))
     doubt = doubt_of(name, best, rivals, fine)

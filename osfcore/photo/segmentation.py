@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from osfcore.errors import InvalidInput
+from osfcore.photo.photograph import WindowFrame
 
 Box = tuple[float, float, float, float]
 Picture = UInt8[np.ndarray, "h w 3"]
 Labels = UInt8[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 Points = Float[np.ndarray, "_ 2"]
+Pair = tuple[np.ndarray, np.ndarray]  # of what is on the object and of what is not
 MIN_BOX_SIDE = 8
 _WORKING_SIDE = 200  # of the box at most [px]: fine enough for an outline, and fast
 _MARGIN = 0.2  # of the box's sides: what lies so near around it is the sample of the background
@@ -57,12 +58,14 @@ def propose_mask(
     box = _checked_box(box, *shape)
     clicks = _checked_clicks(foreground, box), np.zeros((0, 2)) if background is None else background
     strokes = _checked_stroke(add, shape), _checked_stroke(remove, shape)
-    window = _Window.around(box, *shape)
-    picture = cv2.bilateralFilter(window.reduced(image), -1, _NOISE_LEVELS, _NOISE_RADIUS)
-    corners = np.round(window.points(np.reshape(box, (2, 2)))).astype(int)
+    window = _window(box, *shape)
+    picture = cv2.bilateralFilter(window.cut(image), -1, _NOISE_LEVELS, _NOISE_RADIUS)
+    corners = np.round(_within(window, np.reshape(box, (2, 2)))).astype(int)
     marks = _marks(window, corners, clicks, strokes)
     found = [_tidied(_cut(picture, start), marks) for start in _starts(marks, corners)]
-    mask = window.enlarged(min(found, key=lambda mask: _misfit(mask, corners)), shape)
+    best = min(found, key=lambda mask: _misfit(mask, corners)).astype(np.float32)
+    soft = cv2.GaussianBlur(best, (0, 0), _OUTLINE_SIGMA, borderType=cv2.BORDER_REPLICATE)
+    mask = window.placed(soft, shape)
     if not mask.any():
         raise InvalidInput(_WHAT, _corners_text(box), "around something that differs from what surrounds it")
     return mask
@@ -86,47 +89,21 @@ def propose_masks(image: Picture, boxes: Mapping[str, Box], clicks: Mapping[str,
     return masks
 
 
-@dataclass(frozen=True, slots=True)
-class _Window:
-    """A box with some margin, cut out of a picture and reduced."""
+def _window(box: Box, height: int, width: int) -> WindowFrame:
+    """Return a box with some margin, within the picture, and reduced."""
+    x0, y0, x1, y1 = box
+    across, down = _MARGIN * (x1 - x0), _MARGIN * (y1 - y0)
+    left, top = max(0, int(x0 - across)), max(0, int(y0 - down))
+    right, bottom = min(width, int(np.ceil(x1 + across))), min(height, int(np.ceil(y1 + down)))
+    scale = min(1.0, _WORKING_SIDE / max(x1 - x0, y1 - y0))
+    size = max(round(scale * (right - left)), 1), max(round(scale * (bottom - top)), 1)
+    return WindowFrame(left, top, right, bottom, *size)
 
-    left: int
-    top: int
-    right: int
-    bottom: int
-    scale: float
 
-    @staticmethod
-    def around(box: Box, height: int, width: int) -> _Window:
-        x0, y0, x1, y1 = box
-        across, down = _MARGIN * (x1 - x0), _MARGIN * (y1 - y0)
-        right, bottom = min(width, int(np.ceil(x1 + across))), min(height, int(np.ceil(y1 + down)))
-        scale = min(1.0, _WORKING_SIDE / max(x1 - x0, y1 - y0))
-        return _Window(max(0, int(x0 - across)), max(0, int(y0 - down)), right, bottom, scale)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of what is cut out, reduced [px]."""
-        width, height = self.scale * (self.right - self.left), self.scale * (self.bottom - self.top)
-        return max(round(width), 1), max(round(height), 1)
-
-    def reduced(self, picture: np.ndarray) -> np.ndarray:
-        """Cut a picture out, averaged."""
-        part = picture[self.top : self.bottom, self.left : self.right]
-        return cv2.resize(part, self.size, interpolation=cv2.INTER_AREA)
-
-    def points(self, points: Points) -> Points:
-        """Map positions into the reduced picture."""
-        per_px = np.array(self.size) / (self.right - self.left, self.bottom - self.top)
-        return (points - (self.left, self.top)) * per_px
-
-    def enlarged(self, mask: Bool[np.ndarray, "a b"], shape: tuple[int, int]) -> Mask:
-        """Put a mask at its place in the whole picture, its outline smooth."""
-        soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _OUTLINE_SIGMA, borderType=cv2.BORDER_REPLICATE)
-        whole = np.zeros(shape, bool)
-        size = self.right - self.left, self.bottom - self.top
-        whole[self.top : self.bottom, self.left : self.right] = cv2.resize(soft, size) > 0.5
-        return whole
+def _within(window: WindowFrame, points: Points) -> Points:
+    """Map positions into the reduced picture [px]."""
+    per_px = np.array([window.width, window.height]) / (window.right - window.left, window.bottom - window.top)
+    return (points - (window.left, window.top)) * per_px
 
 
 def _checked_box(box: Box, height: int, width: int) -> Box:
@@ -134,9 +111,8 @@ def _checked_box(box: Box, height: int, width: int) -> Box:
     inside = max(x0, 0.0), max(y0, 0.0), min(x1, float(width)), min(y1, float(height))
     sides = inside[2] - inside[0], inside[3] - inside[1]
     if not np.all(np.isfinite(box)) or not min(sides) > 0:
-        raise InvalidInput(
-            _WHAT, _corners_text(box), f"within the picture's {width} x {height}, given as left, top, right, bottom"
-        )
+        allowed = f"within the picture's {width} x {height}, given as left, top, right, bottom"
+        raise InvalidInput(_WHAT, _corners_text(box), allowed)
     if min(sides) < MIN_BOX_SIDE:
         raise InvalidInput(_WHAT, _corners_text(box), f"at least {MIN_BOX_SIDE} a side within the picture")
     return inside
@@ -146,9 +122,8 @@ def _checked_clicks(points: np.ndarray, box: Box) -> Points:
     low, high = np.reshape(box, (2, 2))
     inside = np.all((points >= low) & (points < high), axis=1)  # false for NaN
     if not inside.all():
-        raise InvalidInput(
-            "click on the object [px]", points[~inside][0].tolist(), f"inside its box, {_corners_text(box)}"
-        )
+        allowed = f"inside its box, {_corners_text(box)}"
+        raise InvalidInput("click on the object [px]", points[~inside][0].tolist(), allowed)
     return points
 
 
@@ -162,24 +137,21 @@ def _corners_text(box: Box) -> str:
     return ", ".join(f"{side:.0f}" for side in box)
 
 
-def _marks(
-    window: _Window, corners: np.ndarray, clicks: tuple[np.ndarray, np.ndarray], strokes: tuple[np.ndarray, np.ndarray]
-) -> Labels:
+def _marks(window: WindowFrame, corners: np.ndarray, clicks: Pair, strokes: Pair) -> Labels:
     """Label each pixel: GC_FGD or GC_BGD where marks say so, GC_PR_FGD where it is to be found out."""
-    width, height = window.size
-    marks = np.full((height, width), cv2.GC_BGD, np.uint8)
+    marks = np.full((window.height, window.width), cv2.GC_BGD, np.uint8)
     (x0, y0), (x1, y1) = corners
     marks[y0:y1, x0:x1] = cv2.GC_PR_FGD
     radius = max(round(_CLICK_RADIUS * min(x1 - x0, y1 - y0)), 1)
     on_object = np.zeros_like(marks)
-    for point in window.points(clicks[0]):
+    for point in _within(window, clicks[0]):
         cv2.circle(on_object, np.floor(point).astype(int).tolist(), radius, 1, -1)
-    for point in window.points(clicks[1]):
+    for point in _within(window, clicks[1]):
         cv2.circle(marks, np.floor(point).astype(int).tolist(), radius, cv2.GC_BGD, -1)
     marks[y0:y1, x0:x1][on_object[y0:y1, x0:x1] > 0] = cv2.GC_FGD
     some = 0.3  # of a pixel's area is enough for a stroke that is thin
-    marks[window.reduced(strokes[0]) > some] = cv2.GC_FGD
-    marks[window.reduced(strokes[1]) > some] = cv2.GC_BGD
+    marks[window.cut(strokes[0]) > some] = cv2.GC_FGD
+    marks[window.cut(strokes[1]) > some] = cv2.GC_BGD
     return marks
 
 

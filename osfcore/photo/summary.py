@@ -7,16 +7,25 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
 from osfcore.io.scene_file import CameraJson
-from osfcore.photo.board import PAGE_M, UNKNOWN_FOCAL, Board, BoardView, locate_board
+from osfcore.photo.board import (
+    CONTRADICTED,
+    PAGE_M,
+    UNKNOWN_FOCAL,
+    Board,
+    BoardView,
+    Intrinsics,
+    Lens,
+    locate_board,
+    locate_board_through_lens,
+)
 from osfcore.photo.calibration import KnownCamera
 from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, FoundScene
-from osfcore.photo.lamp import photo_lamp, photo_light
-from osfcore.photo.lens import CONTRADICTED, Lens, locate_board_through_lens
+from osfcore.photo.lamp import LampFit, NearLampFit, photo_lamp, photo_light
 from osfcore.photo.photograph import Photograph
 from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, PhotoPose, PhotoStep
 from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, intrinsics_from_focal
@@ -53,8 +62,7 @@ def _light(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels) -
     """Find the lamp in the frame of the table where there is one; also sentences on what is not known of it."""
     surfels, found = [models.surfels(each.name, FINE_ACROSS) for each in step.found], step.found
     if step.table is None and not photos[0].on_table:
-        fit = photo_light(photos[0], found, surfels)
-        light = _found_light(fit.direction, fit.std, is_diffuse=fit.is_diffuse)
+        light = _found_light(photo_light(photos[0], found, surfels))
         return light, ["How far away the lamp is, cannot be told without a known table."]
     covered: tuple[float, float] | None = PAGE_M
     if step.table is not None:
@@ -62,7 +70,7 @@ def _light(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels) -
         photos = [replace(photos[0], T_world_camera=place, on_table=True)]
         found = [replace(each, best=replace(each.best, pose=place @ each.best.pose)) for each in found]
     fit = photo_lamp(photos, found, surfels, covered_m=covered)
-    light = _found_light(fit.direction, fit.std, is_diffuse=fit.is_diffuse)
+    light = _found_light(fit)
     if fit.is_diffuse:
         return light, []
     if not fit.distance_known:
@@ -71,9 +79,9 @@ def _light(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels) -
     return light.model_copy(update=far), []
 
 
-def _found_light(direction: Float[np.ndarray, "3"], std: float, *, is_diffuse: bool) -> FoundLight:
-    facts = {"std_deg": float(np.rad2deg(std)), "distance_m": None, "distance_std_m": None}
-    return FoundLight(direction=direction.tolist(), diffuse=is_diffuse, **facts)
+def _found_light(fit: LampFit | NearLampFit) -> FoundLight:
+    facts = {"std_deg": float(np.rad2deg(fit.std)), "distance_m": None, "distance_std_m": None}
+    return FoundLight(direction=fit.direction.tolist(), diffuse=fit.is_diffuse, **facts)
 
 
 def _camera(number: int, T_table_world: Pose, photo: Photograph) -> CameraJson:
@@ -86,9 +94,8 @@ def _camera(number: int, T_table_world: Pose, photo: Photograph) -> CameraJson:
 def _found(T_table_world: Pose, found: PhotoObject) -> FoundObject:
     def entry(pose: PhotoPose) -> FoundPose:
         there = T_table_world @ pose.pose
-        return FoundPose(
-            position=there.position.tolist(), quaternion=there.quaternion.tolist(), loss=pose.loss, iou=pose.iou
-        )
+        position, quaternion = there.position.tolist(), there.quaternion.tolist()
+        return FoundPose(position=position, quaternion=quaternion, loss=pose.loss, iou=pose.iou)
 
     best, rivals = entry(found.best), [entry(pose) for pose in found.rivals]
     return FoundObject(**best.model_dump(), name=found.name, doubt=found.doubt, rivals=rivals)
@@ -116,7 +123,7 @@ class Located:
     """
 
     raw: RawPhotograph
-    intrinsics: Float[np.ndarray, "3 3"]
+    intrinsics: Intrinsics
     lens: Lens
     source: FocalSource
     T_world_camera: Pose | None
@@ -192,21 +199,17 @@ def locate_calibrated(raw: RawPhotograph, camera: KnownCamera) -> Located:
     return Located(straight, lens.intrinsics, lens, "given", pose, tuple(notes), missing)
 
 
-def _over_board(
-    raw: RawPhotograph, given: Float[np.ndarray, "3 3"] | None, notes: list[str]
-) -> tuple[BoardView, Lens, FocalSource]:
+def _over_board(raw: RawPhotograph, given: Intrinsics | None, notes: list[str]) -> tuple[BoardView, Lens, FocalSource]:
     """Find camera, lens and source of the focal length; one that the board leaves open is guessed, and noted."""
-    source: FocalSource = "board" if given is None else "given"
     try:
-        view, lens = locate_board_through_lens(raw.eight_bit, Board(), given)
+        return *locate_board_through_lens(raw.eight_bit, Board(), given), "board" if given is None else "given"
     except InvalidInput as error:
         if error.what != UNKNOWN_FOCAL:
             raise
         guess, note = guessed_intrinsics(raw)
-        view, lens = locate_board_through_lens(raw.eight_bit, Board(), guess)
-        notes.append(f"The board is seen so that it does not tell the focal length. {note}")
-        source = _guess_source(raw)
-    return view, lens, source
+        found = locate_board_through_lens(raw.eight_bit, Board(), guess)
+        notes.append(f"The board is seen so that it does not show the focal length. {note}")
+        return *found, _guess_source(raw)
 
 
 def _guess_source(raw: RawPhotograph) -> FocalSource:

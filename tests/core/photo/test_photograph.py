@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,15 +15,8 @@ TABLE = Pose(np.array([0.1, -0.5, 0.7]), quaternion_exp(np.array([2.2, 0.1, 0.0]
 
 
 def photograph(height=48, width=64, **changed):
-    image = np.random.default_rng(0).random((height, width, 3), np.float32)
-    facts = {
-        "image": image,
-        "well_exposed": np.ones((height, width), bool),
-        "intrinsics": K,
-        "T_world_camera": TABLE,
-        "on_table": True,
-    }
-    return Photograph(**(facts | changed))
+    image, exposed = np.random.default_rng(0).random((height, width, 3), np.float32), np.ones((height, width), bool)
+    return replace(Photograph(image, exposed, K, TABLE, True), **changed)
 
 
 def disc(height, width, centre=(30.0, 22.0), radius=14.0):
@@ -84,8 +79,7 @@ def test_a_pixel_is_well_exposed_only_if_all_that_it_is_made_of_is(longest, seed
 
 def test_a_photo_is_never_enlarged_nor_reduced_to_nothing():
     whole = photograph(masks={"pin": disc(48, 64, radius=1.0)})
-    assert whole.resized(64) is whole
-    assert whole.resized(1000) is whole
+    assert whole.resized(64) is whole.resized(1000) is whole
     for longest in (8, 0):
         with pytest.raises(InvalidInput, check=about("longest side")):
             whole.resized(longest)

@@ -86,26 +86,17 @@ def test_the_same_input_gives_the_same_mask_whatever_happened_before():
     np.testing.assert_array_equal(*masks)
 
 
-def two_discs():
+def test_the_click_says_which_of_two_objects_is_meant():
     rng = np.random.default_rng(3)
     left, right = disc((65, 80), 26), disc((135, 80), 26)
     surface = textured(rng, (190, 60, 50))
     image = drawn(textured(rng, (120, 130, 120)), (surface, left), (surface, right), rng=rng)
-    return image, left, right
-
-
-def test_the_click_says_which_of_two_objects_is_meant():
-    image, left, right = two_discs()
-    box = box_around(left | right)
-    for meant, click in ((left, (65.0, 80.0)), (right, (135.0, 80.0))):
-        assert overlap(propose_mask(image, box, np.array([click])), meant) > 0.9
-
-    everything = propose_mask(image, box, np.array([[65.0, 80.0], [135.0, 80.0]]))
-    assert overlap(everything, left | right) > 0.9
-    clicks = {"left": np.array([[65.0, 80.0]]), "right": np.array([[135.0, 80.0]])}
-    masks = propose_masks(image, {"left": box, "right": box}, clicks)
-    assert overlap(masks["left"], left) > 0.9
-    assert overlap(masks["right"], right) > 0.9
+    box, clicks = box_around(left | right), {"left": np.array([[65.0, 80.0]]), "right": np.array([[135.0, 80.0]])}
+    masks = propose_masks(image, dict.fromkeys(clicks, box), clicks)
+    for name, meant in (("left", left), ("right", right)):
+        assert overlap(propose_mask(image, box, clicks[name]), meant) > 0.9
+        assert overlap(masks[name], meant) > 0.9
+    assert overlap(propose_mask(image, box, np.concatenate(list(clicks.values()))), left | right) > 0.9
 
 
 def test_a_click_beside_the_object_and_strokes_over_it_count():
@@ -136,11 +127,9 @@ def test_an_object_may_fill_the_picture_or_lead_out_of_it():
     cut = slice(ys.min() + 10, None), slice(xs.min() + 10, None)
     part, true = np.ascontiguousarray(image[cut]), shape[cut]
     click = np.argwhere(true).mean(axis=0)[::-1][None] + 0.5
-    x1, y1 = box_around(true)[2:]
-    assert overlap(propose_mask(part, (-20, -20, x1, y1), click), true) > 0.9
+    assert overlap(propose_mask(part, (-20, -20, *box_around(true)[2:]), click), true) > 0.9
     inside = np.ascontiguousarray(image[ys.min() : ys.max(), xs.min() : xs.max()])
-    whole = propose_mask(inside, (0, 0, inside.shape[1], inside.shape[0]), click)
-    assert whole.any()
+    assert propose_mask(inside, (0, 0, *inside.shape[1::-1]), click).any()
 
 
 @pytest.mark.parametrize(
