@@ -212,8 +212,8 @@ class Episode:
 
     def _noticed_changes(self, before: EstimatedState, expected: SceneState) -> Iterator[Event]:
         now = self._estimate.state
-        angle = lamp_moved(before.state.light, now.light)
-        if angle is not None:
+        angle = before.state.light.angle_to(now.light)
+        if angle > _LAMP_RAD:
             yield self._noticed("lamp", f"The lamp was moved by {np.rad2deg(angle):.0f}°: found again.")
         names = moved_by_hand(expected, now)
         if names:
@@ -527,12 +527,6 @@ class ProgressMonitor:
             return False
         self._least, self._since = distance_m, 0
         return True
-
-
-def lamp_moved(before: Light, now: Light) -> float | None:
-    """Return the angle by which the lamp was moved [rad]; None if it was not."""
-    angle = before.angle_to(now)
-    return angle if angle > _LAMP_RAD else None
 
 
 def moved_by_hand(expected: SceneState, now: SceneState) -> tuple[str, ...]:

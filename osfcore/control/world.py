@@ -133,15 +133,11 @@ def brightness_change(before: Observation, now: Observation) -> float | None:
         before: an observation.
         now: a later one; cameras that are in both are compared.
     """
-    pairs = [
-        (_grey(before.images[a]), _grey(now.images[b]))
-        for a, one in enumerate(before.cameras)
-        for b, other in enumerate(now.cameras)
-        if one.name == other.name
-    ]
-    if not pairs:
+    views = [(a, b) for a, x in enumerate(before.cameras) for b, y in enumerate(now.cameras) if x.name == y.name]
+    if not views:
         return None
-    old, new = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
+    images = before.images[[a for a, _ in views]], now.images[[b for _, b in views]]
+    old, new = (image.mean(axis=-1).ravel().astype(float) for image in images)
     usable = (old > _DARKEST) & (new > _DARKEST / 4)
     if usable.sum() < _FEW:
         return None
@@ -151,7 +147,3 @@ def brightness_change(before: Observation, now: Observation) -> float | None:
     is_common = len(shadowed) < _FEW or abs(float(np.median(shadowed)) - change) < _AGREES
     is_alike = np.mean(np.abs(ratio - change) < _AGREES) > _ALIKE
     return float(np.exp(change)) if abs(change) > _CHANGE and is_common and is_alike else None
-
-
-def _grey(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "P"]:
-    return image.mean(axis=-1).ravel().astype(float)

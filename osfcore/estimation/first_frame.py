@@ -208,20 +208,22 @@ class _FirstFrameEstimator:
         else:
             yield self._ranking_step("light", "Shading and shadows", starts, light)
             for n, name in enumerate(self._names):
-                starts[n] = self._rerank(n, starts[n], light)
+                # The best again in full resolution, in which labels show.
+                for views, count in ((self._coarse, len(starts[n].losses)), (self._sharp, _RANKED_SHARP)):
+                    own, poses = _visible_part(views, n), starts[n].poses[:count]
+                    starts[n] = rank_poses(self._models, name, own, poses, light)
                 yield self._ranking_step("orientations", f"{name}: under this light", starts, light)
         starts = [found.distinct(self._config.starts) for found in starts]
         starts = yield from self._search_each(better, starts, light)
         params = yield from self._search_jointly(self._initial_guess(starts, light))
         at = yield from self._refine(params)
         at = yield from self._compare_orientations(at, starts)
-        yield self._finish(at)
-
-    def _rerank(self, n: int, starts: RankedPoses, light: np.ndarray) -> RankedPoses:
-        """Rank poses again under a known light, the best in full resolution, in which labels show."""
-        for views, count in ((self._coarse, len(starts.losses)), (self._sharp, _RANKED_SHARP)):
-            starts = rank_poses(self._models, self._names[n], _visible_part(views, n), starts.poses[:count], light)
-        return starts
+        fit, is_held = evaluate_fit(self._models, self._fine, at.params), self._held is not None
+        allowed = relative_allowance(fit)
+        estimate = estimate_with_uncertainty(
+            at.params, at.normals, fit, self._rivals, light_held=is_held, allowed=allowed
+        )
+        yield self._reporter.finish(at, estimate)
 
     def _search_each(
         self, parts: list[ObjectView], starts: list[RankedPoses], light: np.ndarray
@@ -284,13 +286,6 @@ class _FirstFrameEstimator:
             )
             yield self._reporter.refinement(f"{self._names[n]}: the other way round", at)
         return at
-
-    def _finish(self, at: GaussNewtonState) -> EstimateStep:
-        fit = evaluate_fit(self._models, self._fine, at.params)
-        estimate = estimate_with_uncertainty(
-            at.params, at.normals, fit, self._rivals, light_held=self._held is not None, allowed=relative_allowance(fit)
-        )
-        return self._reporter.finish(at, estimate)
 
     def _initial_guess(self, starts: list[RankedPoses], light: np.ndarray) -> SceneParameters:
         """The best of each object's poses; objects without any yet are put far below the table, out of view."""

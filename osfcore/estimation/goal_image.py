@@ -215,8 +215,12 @@ class _GoalImageEstimator:
         self._reporter.total += len(bad) + self._pass
         behind = scene_errors(self._models, self._coarse, without_objects(at.params, bad))
         for n in bad:
-            matches[n] = self._match_any_orientation(n, behind)
-            yield self._step("orientations", f"{self._names[n]}: lying in any way", at.params, matches)
+            name, resting = self._names[n], self._models.resting(self._names[n])
+            matches[n] = match_templates(
+                self._models, self._coarse, name, resting.quaternions, resting.origin_heights,
+                most=2 * _MATCHES, behind=behind,
+            )  # fmt: skip
+            yield self._step("orientations", f"{name}: lying in any way", at.params, matches)
         params = yield from self._assemble(at.params, matches)
         at = yield from self._accept_if_better(at, params, matches, self._everything)
         return (yield from self._reassign(at, matches, self._everything))
@@ -305,13 +309,6 @@ class _GoalImageEstimator:
         return match_templates(
             self._models, self._slide, self._names[n], quaternions, heights, most=_MATCHES, behind=behind, light=light
         )
-
-    def _match_any_orientation(self, n: int, behind: Float[np.ndarray, "h w"]) -> TemplateMatches:
-        name, resting = self._names[n], self._models.resting(self._names[n])
-        return match_templates(
-            self._models, self._coarse, name, resting.quaternions, resting.origin_heights,
-            most=2 * _MATCHES, behind=behind,
-        )  # fmt: skip
 
     def _initial_guess(self, matches: list[TemplateMatches]) -> SceneParameters:
         """The best match of each object; objects without one are out of view."""

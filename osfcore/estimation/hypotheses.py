@@ -473,8 +473,7 @@ class SceneAssembly:
 
     def _alternated(self, params: SceneParameters, views: ObservedViews) -> tuple[SceneParameters, float]:
         """Put each object in turn at its best match, then search the light."""
-        for n, found in enumerate(self._sightings):
-            params, _ = best_placement(self._models, views, params, n, found)
+        params = reassign_poses(self._models, views, params, self._sightings)
         params = replace(params, light=search_light(self._models, self._rough, views, params))
         return params, loss_of(self._models, views, params)
 

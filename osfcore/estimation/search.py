@@ -109,7 +109,6 @@ class CMAES:
 
 
 PLANAR_PARAMETERS = (0, 1, 5)  # among an object's numbers: x, y and the turn about the vertical
-POSE_PARAMETERS = tuple(range(POSE))
 _SHIFT_M, _TURN_RAD, _LIGHT_RAD = 4e-3, 0.1, 0.02  # half the width of central differences
 _MOST_SHIFT_M, _MOST_TURN_RAD, _MOST_LIGHT_RAD = 0.03, 0.4, 0.3
 # lambda: these multiples of the last good one are tried at once, each with its own scale of delta.
@@ -157,7 +156,7 @@ def gauss_newton(
     iterations: int,
     objects: Sequence[int] | None = None,
     light: ObservedViews | None = None,
-    numbers: Sequence[int] = POSE_PARAMETERS,
+    numbers: Sequence[int] = range(POSE),
     until_settled: bool = False,
 ) -> Iterator[GaussNewtonState]:
     """Minimise the photometric loss; yields after each sweep over the objects and the light.
@@ -169,7 +168,7 @@ def gauss_newton(
         iterations: sweeps.
         objects: which objects may move; all by default.
         light: images in which to search the light, coarse ones will do; None holds it.
-        numbers: which of an object's six numbers may change, `POSE_PARAMETERS` or `PLANAR_PARAMETERS`.
+        numbers: which of an object's six numbers may change, all by default; `PLANAR_PARAMETERS` keep it flat.
         until_settled: stop when a sweep hardly lowers the objects' losses.
 
     Yields:
@@ -196,7 +195,9 @@ def _damped_step(
     models: ObjectModels, views: ObservedViews, at: GaussNewtonState, block: int, numbers: Int[np.ndarray, "n"]
 ) -> GaussNewtonState:
     """Take one damped step on some entries of the parameter vector (the equation above)."""
-    params, half = at.params, difference_steps(len(at.params.names))
+    params, count = at.params, len(at.params.names)
+    half = difference_steps(count)
+    most = np.array([*([_MOST_SHIFT_M] * 3 + [_MOST_TURN_RAD] * (POSE - 3)) * count, *[_MOST_LIGHT_RAD] * LIGHT])
     probes = np.zeros((1 + 2 * len(numbers), params.size))
     for row, number in enumerate(numbers):
         probes[1 + 2 * row, number], probes[2 + 2 * row, number] = half[number], -half[number]
@@ -210,7 +211,7 @@ def _damped_step(
     for row, (damping, scale) in enumerate(zip(dampings, _STEP_SCALES, strict=True)):
         damped = normal + np.diag(damping * np.diag(normal) + _TINY)
         steps[row, numbers] = -scale * np.linalg.solve(damped, gradient)
-    steps /= np.maximum(1, (np.abs(steps) / _max_step(len(params.names))).max(axis=1, keepdims=True))
+    steps /= np.maximum(1, (np.abs(steps) / most).max(axis=1, keepdims=True))
     here = float(photometric_loss(errors[:1])[0])
     losses = photometric_loss(residuals(models, views, params.perturbed(steps)))
     best = int(np.argmin(losses))
@@ -230,10 +231,6 @@ def _damped_step(
 def difference_steps(count: int) -> Float[np.ndarray, "P"]:
     """Half the width of the central differences of each parameter, for a scene of `count` objects."""
     return np.array([*([_SHIFT_M] * 3 + [_TURN_RAD] * (POSE - 3)) * count, *[_LIGHT_RAD] * LIGHT])
-
-
-def _max_step(count: int) -> Float[np.ndarray, "P"]:
-    return np.array([*([_MOST_SHIFT_M] * 3 + [_MOST_TURN_RAD] * (POSE - 3)) * count, *[_MOST_LIGHT_RAD] * LIGHT])
 
 
 # Where to begin: positions from the masks, and every way an object can lie, ranked by the masked loss.
@@ -676,9 +673,9 @@ class StepReporter:
         progress = Progress(self.done, self.total, note)
         return EstimateStep(progress, stage, params.state(), candidates, lights, sigma, tuple(losses), loss)
 
-    def refinement(self, note: str, at: GaussNewtonState) -> EstimateStep:
-        """Build the next step, of Gauss-Newton."""
-        return self.step("polish", note, at.params, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
+    def refinement(self, note: str, at: GaussNewtonState, stage: Stage = "polish") -> EstimateStep:
+        """Build the next step from where Gauss-Newton is."""
+        return self.step(stage, note, at.params, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
 
     def refinements(
         self, note: str, at: GaussNewtonState, sweeps: Iterator[GaussNewtonState]

@@ -40,7 +40,7 @@ from osfcore.estimation.search import (
     search_light,
     search_scene,
 )
-from osfcore.estimation.steps import EstimateStep, Stage
+from osfcore.estimation.steps import EstimateStep
 from osfcore.estimation.uncertainty import (
     MAX_RESIDUAL,
     FitQuality,
@@ -143,7 +143,9 @@ class _Tracker:
         self._sharp = views_of(observation, FINE_SIDE)
         self._coarse = views_of(observation, FINE_SIDE // 2)
         self._rough = views_of(observation, FINE_SIDE // 4)
-        self._push = _pusher_motion(expected.pusher, observation.pusher)
+        self._push = np.zeros(3)  # of the pusher along the table [m]; zero where it was or is not there
+        if expected.pusher is not None and observation.pusher is not None:
+            self._push[:2] = (observation.pusher - expected.pusher)[:2]
         self._rivals: dict[int, float] = {}
         self._last_fit: tuple[SceneParameters, FitQuality] | None = None
         self._light_held = True
@@ -151,19 +153,21 @@ class _Tracker:
 
     def steps(self) -> Iterator[EstimateStep]:
         at = GaussNewtonState.at(self._initial)
-        before = self._fit_at_half_size(at.params)
+        before = evaluate_fit(self._models, self._middle, at.params)
         if before.surroundings > self._config.lamp_above:
             at = yield from self._search_light(at)
-            before = self._fit_at_half_size(at.params)
+            before = evaluate_fit(self._models, self._middle, at.params)
         misfit = object_residuals(before) > np.maximum(self._config.stays_below, self._allowed)
         if misfit.any():
             at = yield from self._refine(at, misfit, self._coarse, 1)
             misfit &= self._poorly_fitted(at.params)
-        moved = misfit
+        moved, e = misfit, self._config
+        coarse_to_fine = (self._rough, e.rough_sweeps), (self._coarse, e.sweeps), (self._middle, e.fine_sweeps)
         for look in (self._try_pushes, self._search):
             if misfit.any():
                 at = yield from look(at, misfit)
-                at = yield from self._refine_coarse_to_fine(at, misfit)
+                for views, sweeps in coarse_to_fine:
+                    at = yield from self._refine(at.undamped(), misfit, views, sweeps)
                 misfit = misfit & self._poorly_fitted(at.params)
         if misfit.any():
             at = yield from self._recover(at, misfit)
@@ -173,15 +177,16 @@ class _Tracker:
         at = yield from self._refine_finely(at, moved & ~misfit)
         if not self._light_held:  # descent also says how well it is known
             *_, at = gauss_newton(self._models, self._coarse, at, iterations=4, objects=[], light=self._middle)
-        yield self._finish(at)
-
-    def _fit_at_half_size(self, params: SceneParameters) -> FitQuality:
-        """Evaluate how well a guess explains the images of half resolution."""
-        return evaluate_fit(self._models, self._middle, params)
+        fit, allowed = self._fit_finely(at.params), np.maximum(MAX_RESIDUAL, self._allowed)
+        estimate = estimate_with_uncertainty(
+            at.params, at.normals, fit, self._rivals, light_held=self._light_held, allowed=allowed
+        )
+        yield self._reporter.finish(at, estimate)
 
     def _poorly_fitted(self, params: SceneParameters) -> Bool[np.ndarray, "N"]:
         """Find the objects whose residual is above what is allowed."""
-        return object_residuals(self._fit_at_half_size(params)) > np.maximum(self._config.fits_below, self._allowed)
+        residual = object_residuals(evaluate_fit(self._models, self._middle, params))
+        return residual > np.maximum(self._config.fits_below, self._allowed)
 
     def _search_light(self, at: GaussNewtonState) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Search the light with the objects where they were expected; keep it if the loss falls far enough."""
@@ -191,7 +196,7 @@ class _Tracker:
         here, there = (loss_of(self._models, self._coarse, one) for one in (at.params, params))
         if there < self._config.lamp_gain * here:
             at, self._light_held = replace(at, params=params), False
-        yield self._step("light", "Shading and shadows", at)
+        yield self._reporter.refinement("Shading and shadows", at, "light")
         return at
 
     def _refine(
@@ -201,28 +206,22 @@ class _Tracker:
         refined = gauss_newton(self._models, views, at, iterations=sweeps, objects=objects, until_settled=True)
         return (yield from self._reporter.refinements("The last millimetres", at, refined))
 
-    def _refine_coarse_to_fine(
-        self, at: GaussNewtonState, moving: Bool[np.ndarray, "N"]
-    ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Refine by Gauss-Newton from coarse to fine images."""
-        e = self._config
-        for views, sweeps in ((self._rough, e.rough_sweeps), (self._coarse, e.sweeps), (self._middle, e.fine_sweeps)):
-            at = yield from self._refine(at.undamped(), moving, views, sweeps)
-        return at
-
     def _try_pushes(
         self, at: GaussNewtonState, misfit: Bool[np.ndarray, "N"]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         """Take the best of the motions that the push may have caused, for all objects together, then for each alone."""
         numbers = np.flatnonzero(misfit).tolist()
-        at = replace(at, params=self._best_joint_push(at.params, numbers))
+        together = joint_push_hypotheses(at.params, numbers, self._push)
+        batch = replace(at.params.repeated(len(together)), positions=together)
+        best = int(photometric_loss(residuals(self._models, self._coarse, batch)).argmin())
+        at = replace(at, params=replace(at.params, positions=together[best]))
         for n in numbers:
             views = crop_to_object(self._coarse, self._models, at.params, n, reach=self._config.reach)
             tried = push_hypotheses(self._models, at.params, n, self._push)
             losses = pose_losses(self._models, views, at.params, n, tried)
             at = replace(at, params=at.params.with_pose(n, tried[int(losses.argmin())]))
             at = replace(at, params=self._best_rolling_pose(at.params, n))
-            yield self._step("together", f"{at.params.names[n]}: where it was pushed", at)
+            yield self._reporter.refinement(f"{at.params.names[n]}: where it was pushed", at, "together")
         return at
 
     def _search(
@@ -246,13 +245,6 @@ class _Tracker:
                 )
         return at
 
-    def _best_joint_push(self, params: SceneParameters, numbers: list[int]) -> SceneParameters:
-        """The guess with objects moved by the shares of the push that give the lowest photometric loss."""
-        positions = joint_push_hypotheses(params, numbers, self._push)
-        batch = replace(params.repeated(len(positions)), positions=positions)
-        best = int(photometric_loss(residuals(self._models, self._coarse, batch)).argmin())
-        return replace(params, positions=positions[best])
-
     def _best_rolling_pose(self, params: SceneParameters, n: int) -> SceneParameters:
         """The guess with an object turned by the rolling angle of the lowest loss; how far it slipped is unknown."""
         tried = rolling_hypotheses(self._models, params, n, self._push)
@@ -268,7 +260,7 @@ class _Tracker:
         for n in np.flatnonzero(misfit).tolist():
             others = Pose.joined(*(resting_hypotheses(self._models, one, n) for one in (at.params, self._initial)))
             at = self._compare_orientations(at, n, others)
-            yield self._step("together", f"{at.params.names[n]}: lying in another way", at)
+            yield self._reporter.refinement(f"{at.params.names[n]}: lying in another way", at, "together")
         return at
 
     def _refine_finely(
@@ -284,7 +276,7 @@ class _Tracker:
             if bad[n] or self._may_be_turned(at.params, n, others):
                 others = Pose.joined(others, resting_hypotheses(self._models, at.params, n))
                 at = self._compare_orientations(at, n, others)
-                yield self._step("together", f"{at.params.names[n]}: the other way round", at)
+                yield self._reporter.refinement(f"{at.params.names[n]}: the other way round", at, "together")
         return at
 
     def _poorly_fitted_finely(self, params: SceneParameters) -> Bool[np.ndarray, "N"]:
@@ -305,26 +297,6 @@ class _Tracker:
     def _compare_orientations(self, at: GaussNewtonState, n: int, others: Pose) -> GaussNewtonState:
         at, self._rivals[n] = compare_orientations(self._models, self._coarse, self._sharp, self._fine, at, n, others)
         return at
-
-    def _finish(self, at: GaussNewtonState) -> EstimateStep:
-        fit, allowed = self._fit_finely(at.params), np.maximum(MAX_RESIDUAL, self._allowed)
-        estimate = estimate_with_uncertainty(
-            at.params, at.normals, fit, self._rivals, light_held=self._light_held, allowed=allowed
-        )
-        return self._reporter.finish(at, estimate)
-
-    def _step(self, stage: Stage, note: str, at: GaussNewtonState) -> EstimateStep:
-        losses = at.losses[:-1].tolist()
-        return self._reporter.step(stage, note, at.params, losses=losses, loss=float(at.losses[-1]))
-
-
-def _pusher_motion(
-    before: Float[np.ndarray, "3"] | None, after: Float[np.ndarray, "3"] | None
-) -> Float[np.ndarray, "3"]:
-    """Return the pusher's motion along the table [m]; zero if it was not there before or is not there now."""
-    if before is None or after is None:
-        return np.zeros(3)
-    return np.array([*(after - before)[:2], 0.0])
 
 
 # Motion hypotheses: poses that an object may have after a push, as starts of a search; their photometric loss

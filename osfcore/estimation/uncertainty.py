@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from osfcore.estimation.objective import FINE_SIDE, LIGHT, POSE, ObjectModels, ObservedViews, SceneParameters, views_of
 from osfcore.estimation.search import difference_steps
@@ -85,17 +85,10 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParame
         overlap = both / np.maximum(either, 1e-6)
     surroundings = float(np.sqrt((elsewhere * squares).sum() / max(elsewhere.sum(), 1e-6)))
     spread = float(squares.mean())
-    contrast, level = _brightness(opacity, views.images)
-    return FitQuality(residuals * (pixels > 0), pixels, contrast, level, overlap, surroundings, spread)
-
-
-def _brightness(
-    opacity: Float[np.ndarray, "V N h w"], images: Float32[np.ndarray, "V h w 3"]
-) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """Compute the contrast and the level of each object."""
     total = np.maximum(opacity.sum(axis=(0, 2, 3)), 1e-6)[:, None]
-    first, second = (np.einsum("vnhw,vhwc->nc", opacity, images**power) / total for power in (1, 2))
-    return np.sqrt(np.maximum(second - first**2, 0).mean(axis=-1)), np.sqrt(second.mean(axis=-1))
+    first, second = (np.einsum("vnhw,vhwc->nc", opacity, views.images**power) / total for power in (1, 2))
+    contrast, level = np.sqrt(np.maximum(second - first**2, 0).mean(axis=-1)), np.sqrt(second.mean(axis=-1))
+    return FitQuality(residuals * (pixels > 0), pixels, contrast, level, overlap, surroundings, spread)
 
 
 def relative_allowance(fit: FitQuality) -> Float[np.ndarray, "N"]:
@@ -175,7 +168,7 @@ def estimate_with_uncertainty(
         The estimate.
     """
     count = len(params.names)
-    deviations = _deviations(normals, _spreads(fit), count)
+    deviations = _deviations(normals, fit, count)
     poses = deviations[: POSE * count].reshape(count, 2, 3)
     position = _POSITION_FACTOR * np.sqrt((poses[:, 0] ** 2).mean(axis=1))
     rotation = _ROTATION_FACTOR * np.sqrt((poses[:, 1] ** 2).mean(axis=1))
@@ -183,7 +176,7 @@ def estimate_with_uncertainty(
     heights = np.zeros(count) if lowest is None else lowest
     most = np.full(count, MAX_RESIDUAL) if allowed is None else allowed
     doubts = tuple(
-        _reason_for_doubt(fit, n, most[n], position[n], rotation[n], rivals.get(n, np.inf)) or _height_doubt(heights[n])
+        _reason_for_doubt(fit, n, most[n], position[n], rotation[n], rivals.get(n, np.inf), heights[n])
         for n in range(count)
     )
     return EstimatedState(params.state(), position, rotation, light, doubts, reason_for(params.names, doubts))
@@ -194,14 +187,10 @@ def reason_for(names: Sequence[str], doubts: Sequence[str]) -> str:
     return "; ".join(f"{name}: {doubt}" for name, doubt in zip(names, doubts, strict=True) if doubt)
 
 
-def _spreads(fit: FitQuality) -> Float[np.ndarray, "B"]:
-    """s^2 of each block, the objects and last the light [radiance^2]."""
-    own = np.where(fit.pixels.sum(axis=0) < _MIN_PIXELS, np.inf, _MOST_SPREAD * object_residuals(fit) ** 2)
-    return np.append(np.minimum(own, fit.spread), fit.spread)
-
-
-def _deviations(normals: Sequence[np.ndarray], spreads: Float[np.ndarray, "B"], count: int) -> np.ndarray:
+def _deviations(normals: Sequence[np.ndarray], fit: FitQuality, count: int) -> np.ndarray:
     """Compute standard deviations of all parameters; very large where the images do not constrain one."""
+    own = np.where(fit.pixels.sum(axis=0) < _MIN_PIXELS, np.inf, _MOST_SPREAD * object_residuals(fit) ** 2)
+    spreads = np.append(np.minimum(own, fit.spread), fit.spread)  # s^2 of the objects, and last of the light
     widths, found, start = difference_steps(count), [], 0
     for normal, spread in zip(normals, spreads, strict=True):
         own = widths[start : start + len(normal)]
@@ -213,7 +202,7 @@ def _deviations(normals: Sequence[np.ndarray], spreads: Float[np.ndarray, "B"], 
 
 
 def _reason_for_doubt(
-    fit: FitQuality, n: int, most: float, position_std: float, rotation_std: float, rival: float
+    fit: FitQuality, n: int, most: float, position_std: float, rotation_std: float, rival: float, height: float
 ) -> str:
     if SURE_RIVAL_RATIO <= rival < np.inf:
         most = max(most, _SURE_SHARE * fit.level[n])
@@ -224,6 +213,8 @@ def _reason_for_doubt(
         return AMBIGUOUS
     if position_std > _MOST_POSITION_STD_M or rotation_std > _MOST_ROTATION_STD_RAD:
         return f"its pose is known to {1000 * position_std:.0f} mm and {np.rad2deg(rotation_std):.0f} deg only"
+    if abs(height) > _MAX_HEIGHT_M:
+        return f"it would {'float above' if height > 0 else 'sink into'} the table by {1000 * abs(height):.0f} mm"
     return ""
 
 
@@ -244,9 +235,3 @@ def misfits(fit: FitQuality, allowed: Float[np.ndarray, "N"]) -> list[int]:
         allowed: residuals up to which an object's images are not doubted.
     """
     return [n for n in range(len(allowed)) if _misfit(fit, n, allowed[n])]
-
-
-def _height_doubt(height: float) -> str:
-    if abs(height) <= _MAX_HEIGHT_M:
-        return ""
-    return f"it would {'float above' if height > 0 else 'sink into'} the table by {1000 * abs(height):.0f} mm"

@@ -201,8 +201,7 @@ class MPPIPlanner:
             round_ = self._first_round(state, goal, cost, rng, before)
             yield round_
             self._follow(round_)
-        assert self._nominal is not None
-        nominal = self._resized(self._nominal)
+        nominal = self.nominal(self.settings.horizon)  # which may have been changed since
         if self._known is not None and _walks(self._known.rollouts) > _SOON:
             self._nominal = nominal
             yield replace(self._known, number=1, actions=nominal)
@@ -266,20 +265,13 @@ class MPPIPlanner:
     ) -> Float[np.ndarray, "K T 3"]:
         """The nominal sequence and perturbations of it, random walks, and push proposals."""
         settings = self.settings
-        zero = np.zeros((settings.horizon, 3))
-        nominal = zero if self._nominal is None else self._resized(self._nominal)
-        share = settings.samples // 8
-        walks = self._perturbed(zero, share, rng, _RANDOM_WALK_M)
+        nominal, share = self.nominal(settings.horizon), settings.samples // 8
+        walks = self._perturbed(np.zeros_like(nominal), share, rng, _RANDOM_WALK_M)
         around = self._perturbed(nominal, share, rng, settings.noise_m)
         if share > 1:
             around[1] = _hurried(nominal)
         pushes = self._proposals.draw(state, goal, settings.samples - 2 * share, settings.horizon, rng)
         return np.concatenate([around, walks, pushes])
-
-    def _resized(self, plan: Float[np.ndarray, "before 3"]) -> Float[np.ndarray, "T 3"]:
-        """The plan at today's horizon, which may have been changed since."""
-        horizon = self.settings.horizon
-        return np.concatenate([plan[:horizon], np.zeros((max(horizon - len(plan), 0), 3))])
 
     def _perturbed(
         self,

@@ -62,31 +62,22 @@ class FreeSpace:
 
     def paths_from(self, start: Float[np.ndarray, "2"]) -> ShortestPaths:
         """All shortest paths from a place within reach [m]."""
-        return ShortestPaths(self, start)
-
-    def cost(self) -> Float[np.ndarray, "S S"]:
-        """Cost of each cell of a path."""
-        return np.where(self._free, 1.0, _BLOCKED)
-
-    def has_line_of_sight(self, a: Int[np.ndarray, "2"], b: Int[np.ndarray, "2"]) -> bool:
-        """Decide whether the straight line between two cells is free, but for its ends."""
-        rows, columns = line(*a, *b)
-        return bool(self._free[rows[1:-1], columns[1:-1]].all())
+        return ShortestPaths(self._free, start)
 
 
 class ShortestPaths:
     """Shortest paths from one place.
 
     Args:
-        space: that they lead through.
+        free: cells that they should lead through.
         start: where they begin [m].
     """
 
-    def __init__(self, space: FreeSpace, start: Float[np.ndarray, "2"]) -> None:
+    def __init__(self, free: Bool[np.ndarray, "S S"], start: Float[np.ndarray, "2"]) -> None:
         from skimage.graph import MCP_Geometric
 
-        self._space, self._start = space, start
-        self._search = MCP_Geometric(space.cost())
+        self._free, self._start = free, start
+        self._search = MCP_Geometric(np.where(free, 1.0, _BLOCKED))
         self._search.find_costs(_cells(start[None]).clip(0, _SIDE - 1).tolist())
 
     def to(self, end: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
@@ -96,11 +87,14 @@ class ShortestPaths:
         return np.concatenate([self._start[None], corners[1:-1], end[None]])
 
     def _corners(self, cells: Int[np.ndarray, "n 2"]) -> list[int]:
-        """Shortcut smoothing: each corner is followed by the farthest one in line of sight."""
+        """Shortcut smoothing: each corner is followed by the farthest one with a free line between them."""
         kept, at = [0], 0
         while at < len(cells) - 1:
             later = len(cells) - 1
-            while later > at + 1 and not self._space.has_line_of_sight(cells[at], cells[later]):
+            while later > at + 1:
+                rows, columns = line(*cells[at], *cells[later])
+                if self._free[rows[1:-1], columns[1:-1]].all():
+                    break
                 later = at + max((later - at) * 3 // 4, 1)
             at = later
             kept.append(at)

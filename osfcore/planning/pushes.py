@@ -165,18 +165,14 @@ def _corners(n: int, places: Sequence[Pose], target: Pose, outlines: OutlinesAt)
     none = np.zeros((0, 2))
     if not others or np.linalg.norm(end - begin) < 2 * _MIN_DETOUR_M:
         return none
-    space = FreeSpace(others, _breadth(outlines(n, places[n]), begin, end) / 2)
+    way = (end - begin) / max(float(np.linalg.norm(end - begin)), 1e-9)
+    breadth = float(np.ptp(np.concatenate(outlines(n, places[n])) @ np.array([-way[1], way[0]])))  # across the way
+    space = FreeSpace(others, breadth / 2)
     if np.all(space.is_free(np.linspace(begin, end, _CHECKED))):
         return none
     path = space.paths_from(begin).to(end)
     corners = cv2.approxPolyDP(path.astype(np.float32), _MIN_DETOUR_M, closed=False)[1:-1, 0].astype(float)
     return none if len(corners) > _CORNERS or np.abs(corners).max(initial=0.0) > _ROOM_M else corners
-
-
-def _breadth(outlines: Outlines, begin: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
-    """Measure the breadth of an object across the way that it goes [m]."""
-    way = (end - begin) / max(float(np.linalg.norm(end - begin)), 1e-9)
-    return float(np.ptp(np.concatenate(outlines) @ np.array([-way[1], way[0]])))
 
 
 def _moved(pose: Pose, place: Float[np.ndarray, "2"]) -> Pose:
