@@ -13,9 +13,8 @@ from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.estimation.objective import resting_orientations
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_to_matrix, rotation_angle
-from osfcore.geometry.states import EstimatedState, Observation, SceneState
+from osfcore.geometry.states import EstimatedState, Observation
 from osfcore.io.image_file import write_png
 from osfcore.photo.bop import (
     BopChoice,
@@ -31,11 +30,11 @@ from osfcore.photo.bop import (
 from osfcore.photo.pose_loss import TablePrior
 from tests.support.bop_scenes import annotation, write_bop_scene, write_models_info
 from tests.support.errors import about
+from tests.support.posed_scenes import NAMES, lying, scene, shipped_models
 
 # Our own scene, written as BOP does, is read as it was; results are what BOP's toolkit reads.
 
 
-NAMES = ("003_cracker_box", "006_mustard_bottle")
 LINEAR = BopChoice(encoding="linear")
 CENTRES = {"003_cracker_box": (0.01, -0.02, 0.03), "006_mustard_bottle": (-0.015, 0.0, 0.002)}
 
@@ -53,14 +52,10 @@ def prior(fields):
 @pytest.fixture(scope="module")
 def rendered(fields):
     """Observation and true state of two objects that stand on the table; the pictures are noise."""
-    rng, cameras, poses = np.random.default_rng(3), default_cameras(64), []
-    for x, name in zip((-0.08, 0.1), NAMES, strict=True):
-        resting = resting_orientations(fields.load(name))
-        lying = Pose(np.zeros(3), resting.quaternions[0])
-        poses.append(Pose(np.array([x, 0.03, -resting.lowest(lying)]), lying.quaternion))
+    rng, models = np.random.default_rng(3), shipped_models()
+    state = scene({name: lying(models, name, 0, x, 0.03) for x, name in zip((-0.08, 0.1), NAMES, strict=True)})
     images, masks = rng.integers(0, 256, (4, 64, 64, 3)) / 255, rng.random((4, 2, 64, 64)) > 0.5
-    state = SceneState(NAMES, Pose.stacked(poses), Light(np.array([0, 0, 1.0])), None)
-    return Observation(cameras, images.astype(np.float32), NAMES, masks, None, 0.0), state
+    return Observation(default_cameras(64), images.astype(np.float32), NAMES, masks, None, 0.0), state
 
 
 @pytest.fixture
@@ -80,17 +75,16 @@ def edit(path, change):
 
 def test_what_was_written_is_read(folder, rendered):
     observation, state = rendered
-    scene = read_bop_scene(folder, LINEAR)
-    read = scene.observation
+    found = read_bop_scene(folder, LINEAR)
+    read = found.observation
     assert [camera.name for camera in read.cameras] == ["3", "6", "9", "12"]
     assert read.names == NAMES
     for ours, theirs in zip(observation.cameras, read.cameras, strict=True):
         assert same(ours.T_world_camera, theirs.T_world_camera)
         np.testing.assert_allclose(theirs.intrinsics, ours.intrinsics, atol=1e-9)
     for name in NAMES:
-        assert same(scene.poses[name], state.pose(name))
-        ours, theirs = (o.masks[:, o.names.index(name)] for o in (observation, read))
-        np.testing.assert_array_equal(theirs, ours)
+        assert same(found.poses[name], state.pose(name))
+    np.testing.assert_array_equal(read.masks, observation.masks)
     np.testing.assert_allclose(read.images, observation.images, atol=1e-6)
 
 
@@ -99,11 +93,10 @@ def test_results_are_read_by_the_rules_of_the_toolkit(rendered, tmp_path, centre
     observation, state = rendered
     folder = write_bop_scene(tmp_path / "000048", *rendered, centres=centres)
     models = None if centres is None else write_models_info(tmp_path / "models", centres)
-    scene = read_bop_scene(folder, BopChoice(encoding="linear", models=models))
-    assert all(same(scene.poses[name], state.pose(name)) for name in NAMES)
-    deviations = np.array([0.0, 0.001]), np.zeros(2)
-    estimate = EstimatedState(state.reordered(NAMES), *deviations, 0.0, ("", ""), "")
-    text = bop_results(estimate, scene.observation.cameras, 48, models, 2.5)
+    found = read_bop_scene(folder, BopChoice(encoding="linear", models=models))
+    assert all(same(found.poses[name], state.pose(name)) for name in NAMES)
+    estimate = EstimatedState(state, np.array([0.0, 0.001]), np.zeros(2), 0.0, ("", ""), "")
+    text = bop_results(estimate, found.observation.cameras, 48, models, 2.5)
     header, *lines = text.splitlines()
     assert header == "scene_id,im_id,obj_id,score,R,t,time"
     annotations = json.loads((folder / "scene_gt.json").read_text())
@@ -111,8 +104,8 @@ def test_results_are_read_by_the_rules_of_the_toolkit(rendered, tmp_path, centre
     for line in lines:
         scene_id, im_id, obj_id, score, R, t, seconds = line.split(",")  # as bop_toolkit_lib.inout.load_bop_results
         (truth,) = (e for e in annotations[im_id] if e["obj_id"] == int(obj_id))
-        np.testing.assert_allclose(np.array(list(map(float, R.split()))), truth["cam_R_m2c"], atol=1e-6)
-        np.testing.assert_allclose(np.array(list(map(float, t.split()))), truth["cam_t_m2c"], atol=1e-3)
+        np.testing.assert_allclose(np.array(R.split(), float), truth["cam_R_m2c"], atol=1e-6)
+        np.testing.assert_allclose(np.array(t.split(), float), truth["cam_t_m2c"], atol=1e-3)
         assert (int(scene_id), float(seconds)) == (48, 2.5)
         assert float(score) == {2: 1.0, 5: 0.5}[int(obj_id)]
     if centres is None:
@@ -120,32 +113,25 @@ def test_results_are_read_by_the_rules_of_the_toolkit(rendered, tmp_path, centre
         poses = read_poses(tmp_path / "results.csv", PoseChoice(image=6))
         T_camera_world = observation.cameras[1].T_world_camera.inverse()
         assert all(same(poses[name], T_camera_world @ state.pose(name)) for name in NAMES)
-    with pytest.raises(UnknownName, check=about("016_pear")):
-        bop_results(replace(estimate, state=replace(state, names=("016_pear", NAMES[1]))), observation.cameras, 1)
-    with pytest.raises(InvalidInput, check=about("name of a camera")):
-        bop_results(estimate, (replace(observation.cameras[0], name="goal"),), 1)
+    pear = replace(estimate, state=replace(state, names=("016_pear", NAMES[1])))
+    refused(UnknownName, "016_pear", bop_results, pear, observation.cameras, 1)
+    refused(InvalidInput, "name of a camera", bop_results, estimate, (replace(observation.cameras[0], name="goal"),), 1)
 
 
-def test_a_table_is_found_under_the_objects_of_any_world(folder, rendered, prior):
-    def tilt(content):  # the world of the first camera
-        first = {k: np.array(content["3"][k]) for k in ("cam_R_w2c", "cam_t_w2c")}
-        R0, t0 = first["cam_R_w2c"].reshape(3, 3), first["cam_t_w2c"]
-        for entry in content.values():
-            R = np.array(entry["cam_R_w2c"]).reshape(3, 3) @ R0.T
-            entry["cam_t_w2c"] = (np.array(entry["cam_t_w2c"]) - R @ t0).tolist()
-            entry["cam_R_w2c"] = R.ravel().tolist()
-
-    edit(folder / "scene_camera.json", tilt)
+def test_a_table_is_found_under_the_objects_of_any_world(rendered, prior, tmp_path):
+    observation, state = rendered
+    T = observation.cameras[0].T_world_camera.inverse()  # to the world of the first camera
+    cameras = tuple(replace(camera, T_world_camera=T @ camera.T_world_camera) for camera in observation.cameras)
+    moved = replace(observation, cameras=cameras), replace(state, poses=T @ state.poses)
+    folder = write_bop_scene(tmp_path / "000048", *moved)
     with pytest.raises(InvalidInput, check=about("height of image 3")):
         read_bop_scene(folder, LINEAR)
-    scene = read_bop_scene(folder, LINEAR, table_prior=prior)
-    cameras = scene.observation.cameras
+    found = read_bop_scene(folder, LINEAR, table_prior=prior)
     for name in NAMES:
-        np.testing.assert_allclose(scene.poses[name].position[2], rendered[1].pose(name).position[2], atol=4e-3)
-        for view, camera in enumerate(cameras):
-            place = camera.project(scene.poses[name].position)
-            expected = rendered[0].cameras[view].project(rendered[1].pose(name).position)
-            np.testing.assert_allclose(place, expected, atol=1e-2)
+        np.testing.assert_allclose(found.poses[name].position[2], state.pose(name).position[2], atol=4e-3)
+        for ours, theirs in zip(observation.cameras, found.observation.cameras, strict=True):
+            place = theirs.project(found.poses[name].position)
+            np.testing.assert_allclose(place, ours.project(state.pose(name).position), atol=1e-2)
 
 
 def test_the_table_is_found_without_objects_that_nobody_knows(folder, rendered, fields, prior):
@@ -158,8 +144,8 @@ def test_the_table_is_found_without_objects_that_nobody_knows(folder, rendered, 
             entries.append(annotation(floating, number))
 
     edit(folder / "scene_gt.json", add_marker)
-    scene = read_bop_scene(folder, LINEAR, table_prior=prior, known=fields.names())
-    assert (scene.observation.names, scene.left_out) == (NAMES, ("040_large_marker",))
+    found = read_bop_scene(folder, LINEAR, table_prior=prior, known=fields.names())
+    assert (found.observation.names, found.left_out) == (NAMES, ("040_large_marker",))
     edit(folder / "scene_camera.json", without_places)
     with pytest.raises(InvalidInput, check=about("cam_R_w2c and cam_t_w2c of image 3")):
         read_bop_scene(folder, LINEAR, table_prior=prior)
@@ -193,22 +179,22 @@ def test_scenes_that_make_no_sense_are_refused(folder, file, change, what):
         read_bop_scene(folder, LINEAR)
 
 
+def refused(kind, what, read, *arguments):
+    with pytest.raises(kind, check=about(what)):
+        read(*arguments)
+
+
 def test_what_is_chosen_must_be_there(folder):
     chosen = read_bop_scene(folder, BopChoice((9,), "linear"), NAMES[1:]).observation
     assert ([camera.name for camera in chosen.cameras], chosen.names) == (["9"], NAMES[1:])
-    with pytest.raises(InvalidInput, check=about("image")):
-        read_bop_scene(folder, BopChoice((4,)))
-    with pytest.raises(InvalidInput, check=about("object")):
-        read_bop_scene(folder, LINEAR, ("025_mug",))
+    refused(InvalidInput, "image", read_bop_scene, folder, BopChoice((4,)))
+    refused(InvalidInput, "object", read_bop_scene, folder, LINEAR, ("025_mug",))
     known = read_bop_scene(folder, LINEAR, known=NAMES[:1])
     assert (known.observation.names, known.left_out) == (NAMES[:1], NAMES[1:])
     (folder / "rgb" / "000003.png").unlink()
-    with pytest.raises(CorruptFile, check=about("000003.png")):
-        read_bop_scene(folder)
-    with pytest.raises(CorruptFile, check=about("scene_camera.json")):
-        read_bop_scene(folder / "rgb")
-    with pytest.raises(CorruptFile, check=about("models_info.json")):
-        read_bop_scene(folder, BopChoice(models=folder))
+    refused(CorruptFile, "000003.png", read_bop_scene, folder)
+    refused(CorruptFile, "scene_camera.json", read_bop_scene, folder / "rgb")
+    refused(CorruptFile, "models_info.json", read_bop_scene, folder, BopChoice(models=folder))
 
 
 # Masks in folders: by name, and as BOP numbers them.
@@ -240,31 +226,28 @@ def test_masks_of_bop(tmp_path, place):
     folder = tmp_path / "mask_visib"
     for image, index, left in ((1, 0, 0), (1, 1, 20), (2, 0, 40)):
         write_png(folder / f"{image:06d}_{index:06d}.png", mask_at(left))
-    with pytest.raises(InvalidInput, check=about("scene_gt.json of the masks")):
-        read_masks(folder, KNOWN, (SIZE, SIZE), 1)
+    refused(InvalidInput, "scene_gt.json of the masks", read_masks, folder, KNOWN, (SIZE, SIZE), 1)
     content = {"1": [annotation(POSE, 14), annotation(POSE, 2)], "2": [annotation(POSE, 8)]}
     write(folder / place, "scene_gt.json", content)
     masks = read_masks(folder, KNOWN, (SIZE, SIZE), 1)
     assert list(masks) == ["025_mug", "003_cracker_box"]
     assert masks["003_cracker_box"][20, 30]
     assert list(read_masks(folder, KNOWN, (SIZE, SIZE), 2)) == ["009_gelatin_box"]
-    with pytest.raises(InvalidInput, check=about("image of the masks")):
-        read_masks(folder, KNOWN, (SIZE, SIZE))
+    refused(InvalidInput, "image of the masks", read_masks, folder, KNOWN, (SIZE, SIZE))
 
 
 def test_folders_without_masks_of_the_photo_are_refused(tmp_path):
-    def refused(folder, kind, what):
-        with pytest.raises(kind, check=about(what)):
-            read_masks(folder, KNOWN, (SIZE, SIZE))
-
-    refused(tmp_path / "none", InvalidInput, "folder of masks")
-    refused(tmp_path, InvalidInput, "number of masks")
-    write_png(tmp_path / "025_mug.png", mask_at(0, 0))
-    refused(tmp_path, InvalidInput, "number of masks")
-    write_png(tmp_path / "025_mug.png", mask_at(10, size=(64, 48)))
-    refused(tmp_path, InvalidInput, "size of the mask 025_mug.png")
+    asked = KNOWN, (SIZE, SIZE)
+    refused(InvalidInput, "folder of masks", read_masks, tmp_path / "none", *asked)
+    refused(InvalidInput, "number of masks", read_masks, tmp_path, *asked)
+    for mask, what in (
+        (mask_at(0, 0), "number of masks"),
+        (mask_at(10, size=(64, 48)), "size of the mask 025_mug.png"),
+    ):
+        write_png(tmp_path / "025_mug.png", mask)
+        refused(InvalidInput, what, read_masks, tmp_path, *asked)
     (tmp_path / "025_mug.png").write_text("no picture")
-    refused(tmp_path, CorruptFile, "025_mug.png")
+    refused(CorruptFile, "025_mug.png", read_masks, tmp_path, *asked)
 
 
 # Poses of other programs: what is written is read, in the frame of the box's centre.
@@ -304,42 +287,34 @@ def test_poses_survive_every_form(tmp_path_factory, turn, position, obj):
         write(folder, "photo.json", {"poses_camera_object": {"mine": {name: entry}}, "image": "photo.png"}),
     ]
     for path in written:
-        (found,) = read_poses(path).items()
-        assert found[0] == name
-        assert same(found[1], pose)
+        ((read, found),) = read_poses(path).items()
+        assert read == name
+        assert same(found, pose)
     rois, values = np.array([[0, obj, 1, 2, 3, 4]]), np.concatenate([pose.quaternion, pose.position])[None]
     savemat(folder / "000001.mat", {"rois": rois, "poses": values, "poses_icp": values})
     found = read_poses(folder / "000001.mat", PoseChoice(source="poses_icp"))
     assert same(found[name], in_object_frame(pose, name, "ycb_video"))
 
 
-@pytest.mark.parametrize("frame", ["ycb_video", "google_16k"])
-@pytest.mark.parametrize("name", ["025_mug", "061_foam_brick"])
-def test_frames_differ_by_a_shift_that_turns_with_the_object(name, frame):
-    still = in_object_frame(Pose.identity(), name, frame)
-    turned = in_object_frame(POSE, name, frame)
-    assert same(turned, POSE @ still)
-    assert 0 < np.linalg.norm(still.position) < 0.15
-    assert same(in_object_frame(POSE, name, "bop"), POSE)
-
-
-def test_the_frame_is_that_of_the_kind_of_file_unless_given(tmp_path):
+def test_the_frame_is_that_of_the_kind_of_file_unless_given_and_frames_differ_by_a_shift(tmp_path):
+    for name in ("025_mug", "061_foam_brick"):
+        assert same(in_object_frame(POSE, name, "bop"), POSE)
+        for frame in ("ycb_video", "google_16k"):
+            still = in_object_frame(Pose.identity(), name, frame)
+            assert same(in_object_frame(POSE, name, frame), POSE @ still)  # it turns with the object
+            assert 0 < np.linalg.norm(still.position) < 0.15
     path = write(tmp_path, "bop.csv", bop_line())
     given = read_poses(path, PoseChoice(frame="ycb_video"))["025_mug"]
     assert same(given, in_object_frame(POSE, "025_mug", "ycb_video"))
     path = write(tmp_path, "bop.csv", bop_line(obj=17))
     assert "037_scissors" in read_poses(path)
-    with pytest.raises(UnknownName, check=about("037_scissors")):
-        read_poses(path, PoseChoice(frame="google_16k"))
+    refused(UnknownName, "037_scissors", read_poses, path, PoseChoice(frame="google_16k"))
 
 
-def test_the_best_score_counts(tmp_path):
+def test_the_best_score_counts_and_rows_of_posecnn_without_a_pose_do_not(tmp_path):
     other = Pose(POSE.position + 0.1, POSE.quaternion)
     lines = [bop_line(other, score=0.2), bop_line(score=0.9), bop_line(other, score=0.5)]
     assert same(read_poses(write(tmp_path, "bop.csv", "\n".join(lines)))["025_mug"], POSE)
-
-
-def test_rows_of_posecnn_without_a_pose_are_left_out(tmp_path):
     poses = np.stack([np.zeros(7), np.concatenate([POSE.quaternion, POSE.position])])
     savemat(tmp_path / "a.mat", {"rois": np.array([[0, 1, 0, 0, 9, 9, 0.9], [0, 14, 0, 0, 9, 9, 0.8]]), "poses": poses})
     assert list(read_poses(tmp_path / "a.mat")) == ["025_mug"]
@@ -348,21 +323,17 @@ def test_rows_of_posecnn_without_a_pose_are_left_out(tmp_path):
 def test_images_and_scenes_are_chosen(tmp_path):
     lines = [HEADER, bop_line(), bop_line(obj=1, image=36), bop_line(obj=2, scene=50)]
     path = write(tmp_path, "bop.csv", "\n".join(lines))
-    with pytest.raises(InvalidInput, check=about("scene of the poses")):
-        read_poses(path)
-    with pytest.raises(InvalidInput, check=about("image of the poses")):
-        read_poses(path, PoseChoice(7, 48))
+    refused(InvalidInput, "scene of the poses", read_poses, path)
+    refused(InvalidInput, "image of the poses", read_poses, path, PoseChoice(7, 48))
     assert list(read_poses(path, PoseChoice(36, 48))) == ["002_master_chef_can"]
-    gt = write(
-        tmp_path, "scene_gt.json", {"1": [annotation(POSE, 14)], "36": [annotation(POSE, 5), annotation(POSE, 2)]}
-    )
+    content = {"1": [annotation(POSE, 14)], "36": [annotation(POSE, 5), annotation(POSE, 2)]}
+    gt = write(tmp_path, "scene_gt.json", content)
     assert list(read_poses(gt, PoseChoice(1))) == ["025_mug"]
     assert scene_gt_names(gt, 36) == ("006_mustard_bottle", "003_cracker_box")
 
     entry = {"025_mug": {"position": [0, 0, 1], "quaternion": [1, 0, 0, 0]}}
     path = write(tmp_path, "photo.json", {"poses_camera_object": {"posecnn_raw": entry, "truth": entry}})
-    with pytest.raises(CorruptFile, check=about("source of the poses")):
-        read_poses(path)
+    refused(CorruptFile, "source of the poses", read_poses, path)
     assert list(read_poses(path, PoseChoice(source="truth"))) == ["025_mug"]
 
 
@@ -399,5 +370,4 @@ def test_files_without_sound_poses_are_refused(tmp_path, name, content, what):
         savemat(tmp_path / name, content)
     else:
         write(tmp_path, name, content)
-    with pytest.raises(CorruptFile, check=about(what)):
-        read_poses(tmp_path / name)
+    refused(CorruptFile, what, read_poses, tmp_path / name)

@@ -60,12 +60,10 @@ def test_what_is_written_is_read_also_as_a_camera_of_a_scene(found, camera_json,
     assert (camera.lens.radial, camera.size) == (found.lens.radial, SIZE)
     plain = camera_from_json(camera_json)
     assert (plain.name, plain.width, plain.height) == ("phone", *SIZE)
-
-
-def test_a_reduced_photograph_is_that_of_the_camera_with_fewer_pixels(camera_json):
-    np.testing.assert_allclose(known_camera(camera_json).lens_at((320, 240)).intrinsics[:2], K[:2] / 2, atol=1e-6)
+    reduced = camera.lens_at((320, 240))  # a photograph with fewer pixels
+    np.testing.assert_allclose(reduced.intrinsics[:2], K[:2] / 2, atol=1e-6)
     with pytest.raises(InvalidInput, check=about("size of the photo")):
-        known_camera(camera_json).lens_at((480, 640))
+        camera.lens_at((480, 640))
 
 
 @pytest.mark.slow
@@ -86,13 +84,13 @@ def test_a_photograph_is_straightened_and_placed_as_calibrated(camera_json, raw)
     assert assumed.T_world_camera is None
     with pytest.raises(InvalidInput, check=about("focal length")):
         locate(blank, 1.0)
-    with pytest.raises(CorruptFile, check=about("wall.jpg")):
-        sight(blank, "wall.jpg")
 
 
 def test_corners_are_in_pixels_of_the_photograph_as_it_was_sent(raw):
     expected = 4 * sighting("table.jpg", POSE.inverse()).points_px
     assert np.abs(sight(raw, "table.jpg").points_px - expected).max() < 4 * 0.1
+    with pytest.raises(CorruptFile, check=about("wall.jpg")):
+        sight(replace(raw, encoded=np.full_like(raw.encoded, 128)), "wall.jpg")
 
 
 @pytest.mark.parametrize(
@@ -184,15 +182,14 @@ def test_errors_grow_with_the_noise_and_shrink_with_photos():
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.3])
 def test_a_board_seen_from_straight_above_does_not_suffice_until_one_photo_is_tilted(noise):
-    frontal, tilted = (
-        assess(sightings(tilts, noise, np.random.default_rng(0))) for tilts in (FRONTAL, (*FRONTAL, (40, 0)))
-    )
+    views = [sightings(tilts, noise, np.random.default_rng(0)) for tilts in (FRONTAL, (*FRONTAL, (40, 0)))]
+    frontal, tilted = map(assess, views)
     assert "focal length" in frontal.missing
     assert frontal.advice.words in frontal.missing
     assert frontal.advice.mean_m < frontal.table.mean_m
     assert tilted.focal_std_px < frontal.focal_std_px / 10
     with pytest.raises(OsfError):
-        calibrated_camera(sightings(FRONTAL, noise, np.random.default_rng(0)))
+        calibrated_camera(views[0])
 
 
 def test_two_photos_or_a_board_beside_the_picture_do_not_suffice():
@@ -217,8 +214,5 @@ def test_photos_that_contradict_the_others_are_named():
             assess(photos)
     with pytest.raises(InvalidInput, check=about("mean distance of the board's corners")):
         assess(sightings(VARIED, 3.0, np.random.default_rng(1)))
-
-
-def test_photos_of_one_name_are_kept_apart():
-    views = [replace(view, name="image.jpg") for view in sightings(VARIED[:3])]
-    assert list(assess(views).rms_px) == ["image.jpg", "image.jpg (2)", "image.jpg (3)"]
+    same = [replace(view, name="image.jpg") for view in views[:3]]
+    assert list(assess(same).rms_px) == ["image.jpg", "image.jpg (2)", "image.jpg (3)"]

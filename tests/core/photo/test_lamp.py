@@ -13,21 +13,16 @@ from tests.support.errors import about
 # A distant lamp, from shading alone.
 
 
-def ball(rng, count=1000):
-    """Pixels of a ball that a camera along z sees: random albedo."""
-    normals = fibonacci_sphere(2 * count)
-    normals = normals[normals[:, 2] < 0]
-    return normals, rng.uniform(0.2, 0.9, (len(normals), 3))
-
-
 def angle_deg(a, b):
     return np.rad2deg(np.arccos(np.clip(a @ b, -1, 1)))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_lamp_is_found_despite_ambient_light_colour_noise_and_highlights(seed):
-    rng = np.random.default_rng(seed)
-    normals, albedo = ball(rng)
+def test_a_lamp_is_found_despite_ambient_light_colour_noise_and_highlights_and_a_room_is_diffuse(seed):
+    """On a ball that a camera along z sees."""
+    rng, normals = np.random.default_rng(seed), fibonacci_sphere(2000)
+    normals = normals[normals[:, 2] < 0]
+    albedo = rng.uniform(0.2, 0.9, normals.shape)
     direction = rng.normal(size=3)
     direction[2] = -abs(direction[2])
     direction /= np.linalg.norm(direction)
@@ -40,13 +35,9 @@ def test_a_lamp_is_found_despite_ambient_light_colour_noise_and_highlights(seed)
     assert not found.is_diffuse
     np.testing.assert_allclose(found.strength, [0.7, 0.6, 0.5], rtol=0.15)
 
-
-def test_a_room_is_called_diffuse():
-    rng = np.random.default_rng(0)
-    normals, albedo = ball(rng)
-    light = 0.5 + 0.2 * normals @ np.array([0.1, -0.9, 0.3])
-    found = fit_lamp(ShadedPixels(albedo * light[:, None] + rng.normal(0, 0.005, albedo.shape), albedo, normals))
-    assert found.is_diffuse
+    room = 0.5 + 0.2 * normals @ np.array([0.1, -0.9, 0.3])
+    radiance = albedo * room[:, None] + rng.normal(0, 0.005, albedo.shape)
+    assert fit_lamp(ShadedPixels(radiance, albedo, normals)).is_diffuse
 
 
 # A near lamp from pixels of two balls on a table, made by the model in closed form.
@@ -71,15 +62,12 @@ def surfaces(rng):
     """Points, normals and owners of what a camera above sees."""
     table = np.column_stack([rng.uniform(-0.35, 0.35, (1000, 2)), np.zeros(1000)])
     table = table[[all(np.linalg.norm(p[:2] - c[:2]) > r for c, r in BALLS) for p in table]]
-    points, normals = [table], [np.tile([0.0, 0.0, 1.0], (len(table), 1))]
-    owner = [np.full(len(table), TABLE)]
-    for number, (centre, radius) in enumerate(BALLS):
-        normal = fibonacci_sphere(350)
-        normal = normal[normal[:, 2] > -0.2]
-        points.append(centre + radius * normal)
-        normals.append(normal)
-        owner.append(np.full(len(normal), number))
-    return np.concatenate(points), np.concatenate(normals), np.concatenate(owner)
+    normals = fibonacci_sphere(350)
+    normals = normals[normals[:, 2] > -0.2]
+    points = np.concatenate([table, *(centre + radius * normals for centre, radius in BALLS)])
+    counts = [len(table), *[len(normals)] * len(BALLS)]
+    owner = np.repeat([TABLE, *range(len(BALLS))], counts)
+    return points, np.concatenate([np.tile([0.0, 0.0, 1.0], (len(table), 1)), *[normals] * len(BALLS)]), owner
 
 
 def reached(points, toward, length):
@@ -132,17 +120,13 @@ def test_place_and_cone_are_recovered_within_their_deviations(place, cone):
 
 
 @pytest.mark.slow
-def test_of_a_distant_lamp_the_distance_stays_unknown():
+def test_of_a_distant_lamp_the_distance_stays_unknown_and_light_from_everywhere_is_called_diffuse():
     direction = np.array([0.5, -0.4, 0.7]) / np.linalg.norm([0.5, -0.4, 0.7])
     found = fit_near_lamp(scene(direction=direction), CENTRE)
     assert not found.is_diffuse
     assert angle_deg(found.direction, direction) < 2
     assert not found.distance_known
     assert found.lamp is None
-
-
-@pytest.mark.slow
-def test_light_from_everywhere_is_called_diffuse():
     assert fit_near_lamp(scene(ambient=0.8), CENTRE).is_diffuse
 
 
@@ -177,23 +161,14 @@ def test_few_pixels_are_refused():
 
 @pytest.mark.parametrize("direction", [(0.6, 0.0, 0.8), (0.0, -0.8, 0.6)])
 def test_shadows_on_the_table_lie_where_geometry_says(direction):
-    points, _, owner = surfaces(np.random.default_rng(0))
-    points, direction = points[owner == TABLE], np.array(direction)
-    expected = reached(points, np.tile(direction, (len(points), 1)), np.inf)
-    found = shadows().from_direction(direction, points)
-    assert np.sum(np.abs(found - expected) > 0.5) < 0.15 * np.sum(1 - expected)
-    place = np.array([0.15, 0.1, 0.3])
-    way = place - points
+    points, normals, owner = surfaces(np.random.default_rng(0))
+    table, direction, place, cast = points[owner == TABLE], np.array(direction), np.array([0.15, 0.1, 0.3]), shadows()
+    way = place - table
     length = np.linalg.norm(way, axis=1)
-    expected = reached(points, way / length[:, None], length)
-    found = shadows().from_place(place, points)
-    assert np.sum(np.abs(found - expected) > 0.5) < 0.15 * np.sum(1 - expected)
-
-
-def test_a_ball_does_not_shade_its_own_lit_side():
-    cast = shadows()
-    centre, radius = BALLS[0]
-    normals = fibonacci_sphere(400)
-    normals = normals[normals[:, 2] > 0.3]
-    lifted = cast.lifted(centre + radius * normals, normals)
-    assert cast.from_direction(np.array([0.0, 0.0, 1.0]), lifted).min() > 0.999
+    for found, expected in (
+        (cast.from_direction(direction, table), reached(table, np.tile(direction, (len(table), 1)), np.inf)),
+        (cast.from_place(place, table), reached(table, way / length[:, None], length)),
+    ):
+        assert np.sum(np.abs(found - expected) > 0.5) < 0.15 * np.sum(1 - expected)
+    lit = (owner == 0) & (normals[:, 2] > 0.3)  # a ball does not shade its own lit side
+    assert cast.from_direction(np.array([0.0, 0.0, 1.0]), cast.lifted(points[lit], normals[lit])).min() > 0.999

@@ -108,28 +108,19 @@ def test_objects_with_few_pixels_or_none_are_refused():
 # The prior of a table
 
 
-@pytest.fixture(scope="module")
-def lying(fields):
+def test_what_stands_on_the_table_pays_nothing_and_the_rest_a_bounded_price(fields):
     resting = resting_orientations(fields[NAME])
-    pose = Pose(np.zeros(3), resting.quaternions[0])
-    return TablePrior(resting), Pose(np.array([0.1, 0.2, -resting.lowest(pose)]), resting.quaternions[0])
-
-
-def test_what_stands_on_the_table_pays_nothing_and_the_rest_a_bounded_price(lying):
-    prior, pose = lying
+    prior, turned = TablePrior(resting), Pose(np.zeros(3), resting.quaternions[0])
+    pose = Pose(np.array([0.1, 0.2, -resting.lowest(turned)]), turned.quaternion)
     high = Pose(pose.position + [0, 0, 0.3], pose.quaternion)
     leaning = Pose(high.position, quaternion_multiply(quaternion_exp(np.array([0.7, 0, 0])), pose.quaternion))
     penalties = prior.penalties(Pose.stacked([pose, high, leaning]))
     assert penalties[0] < 0.1
     np.testing.assert_allclose(penalties[1:], [100 + penalties[0], 200], rtol=0.1)
-
-
-def test_a_gauss_newton_step_brings_it_back_to_the_table(lying):
-    prior, pose = lying
     turn = quaternion_exp(np.array([0.03, -0.05, 0.4]))
     moved = Pose(pose.position + [0, 0, 6e-3], quaternion_multiply(turn, pose.quaternion))
     before = prior.penalties(moved[None])[0]
-    for _ in range(3):
+    for _ in range(3):  # steps of Gauss and Newton bring it back to the table
         normal, right = prior.normal_equations(moved)
         step = np.linalg.solve(normal + 1e-6 * np.eye(6), right)
         moved = Pose(moved.position + step[:3], quaternion_multiply(quaternion_exp(step[3:]), moved.quaternion))

@@ -34,6 +34,7 @@ from tests.support.errors import about
 from tests.support.photographs import NAME, take
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+BOTTLE = "006_mustard_bottle"
 
 # Poses and light of an object in a photograph of unknown exposure, white balance and lamp.
 
@@ -41,6 +42,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture(scope="module")
 def models(fields):
     return PhotoModels(fields)
+
+
+def at(pose, name=NAME, iou=0.95):
+    return PhotoObject(name, PhotoPose(pose, 0.1, iou, 0.1, 0.9), (), "", 0.0, 0.0)
 
 
 def found_in(models, photo, name, config=None):
@@ -61,15 +66,13 @@ def test_poses_are_found_without_a_start_and_from_one_2_cm_and_15_degrees_off(mo
 
 @pytest.mark.slow
 def test_a_wrong_name_is_doubted(models, taken):
-    photo = replace(taken.photo, masks={"006_mustard_bottle": taken.photo.masks[NAME]})
-    assert found_in(models, photo, "006_mustard_bottle").doubt
+    photo = replace(taken.photo, masks={BOTTLE: taken.photo.masks[NAME]})
+    assert found_in(models, photo, BOTTLE).doubt
 
 
 def test_the_lamp_by_the_shading_of_a_bottle(models, fields):
-    bottle = "006_mustard_bottle"
-    taken = take(fields, bottle, light=(0.7, -0.5, -0.4))
-    there = PhotoObject(bottle, PhotoPose(taken.pose, 0.3, 0.95, 0.2, 0.8), (), "", 0.0, 0.0)
-    light = photo_light(taken.photo, [there], [models.surfels(bottle, FINE_ACROSS)])
+    taken = take(fields, BOTTLE, light=(0.7, -0.5, -0.4))
+    light = photo_light(taken.photo, [at(taken.pose, BOTTLE)], [models.surfels(BOTTLE, FINE_ACROSS)])
     assert not light.is_diffuse
     assert np.rad2deg(np.arccos(light.direction @ taken.light)) < 12
 
@@ -86,42 +89,23 @@ def test_objects_without_a_field_and_photos_without_a_common_table_are_refused(m
 # Masks that lack a part of what stands in front, or hold a part of it.
 
 
-BEHIND = "006_mustard_bottle"
-
-
-@pytest.fixture(scope="module")
-def surfels(models):
-    return {name: models.surfels(name, FINE_ACROSS) for name in (NAME, BEHIND)}
-
-
-def at(pose, name=NAME, iou=0.95):
-    return PhotoObject(name, PhotoPose(pose, 0.1, iou, 0.1, 0.9), (), "", 0.0, 0.0)
-
-
-@pytest.fixture
-def spoiled(taken):
-    """The front's mask lacks its left part; that behind it claims the middle of it and something beside it."""
-    whole = taken.photo.masks[NAME]
-    columns = np.nonzero(whole)[1]
-    third = np.quantile(columns, 1 / 3), np.quantile(columns, 2 / 3)
-    x = np.arange(whole.shape[1])
-    front, behind = whole & (x > third[0]), whole & (x > third[0]) & (x < third[1])
-    behind[:20, :20] = True
-    return replace(taken.photo, masks={NAME: front, BEHIND: behind})
-
-
 @pytest.mark.slow
-def test_what_is_drawn_is_added_to_the_others_and_taken_from_the_own_mask(taken, spoiled, surfels):
-    found = [at(taken.pose), at(Pose.identity(), BEHIND, iou=0.5)]
-    (seen,) = without_others([spoiled], BEHIND, found, surfels)
-    whole = taken.photo.masks[NAME]
+def test_what_is_drawn_is_added_to_the_others_and_taken_from_the_own_mask(taken, models):
+    """The front's mask lacks its left part; that behind it claims the middle of it and something beside it."""
+    whole, surfels = taken.photo.masks[NAME], {name: models.surfels(name, FINE_ACROSS) for name in (NAME, BOTTLE)}
+    low, high = np.quantile(np.nonzero(whole)[1], (1 / 3, 2 / 3))
+    x = np.arange(whole.shape[1])
+    front, behind = whole & (x > low), whole & (x > low) & (x < high)
+    behind[:20, :20] = True
+    spoiled, found = replace(taken.photo, masks={NAME: front, BOTTLE: behind}), [at(Pose.identity(), BOTTLE, iou=0.5)]
+    (seen,) = without_others([spoiled], BOTTLE, [at(taken.pose), *found], surfels)
     assert (seen.masks[NAME] & whole).sum() / (seen.masks[NAME] | whole).sum() > 0.95
-    assert seen.masks[BEHIND][:20, :20].all()
-    assert seen.masks[BEHIND].sum() < 400 + 0.05 * spoiled.masks[BEHIND].sum()
-    found[0] = at(taken.pose, iou=0.5)  # an outline that fits badly takes nothing
-    (seen,) = without_others([spoiled], BEHIND, found, surfels)
-    np.testing.assert_array_equal(seen.masks[BEHIND], spoiled.masks[BEHIND])
-    assert without_others([taken.photo], BEHIND, found, surfels) == [taken.photo]
+    assert seen.masks[BOTTLE][:20, :20].all()
+    assert seen.masks[BOTTLE].sum() < 400 + 0.05 * behind.sum()
+    found = [at(taken.pose, iou=0.5), *found]  # an outline that fits badly takes nothing
+    (seen,) = without_others([spoiled], BOTTLE, found, surfels)
+    np.testing.assert_array_equal(seen.masks[BOTTLE], behind)
+    assert without_others([taken.photo], BOTTLE, found, surfels) == [taken.photo]
 
 
 @pytest.mark.slow
@@ -130,15 +114,15 @@ def test_an_object_behind_another_of_which_half_is_marked(models, fields, taken)
     front = Pose(np.array([0.01, 0.05, 0.5]), quaternion_exp(np.array([1.2, 0.9, -0.3])))
     behind = Pose(np.array([0.0, 0.02, 0.64]), quaternion_exp(np.array([-1.5, 0.3, 0.1])))
     both = Pose.stacked([front, behind])
-    batch = SceneBatch((NAME, BEHIND), both.position[None], both.quaternion[None], taken.light[None], None)
+    batch = SceneBatch((NAME, BOTTLE), both.position[None], both.quaternion[None], taken.light[None], None)
     camera = Camera("photo", Pose.identity(), taken.photo.intrinsics, 300, 260)
     drawn = SceneRenderer(fields, None).render(batch, [camera], outputs={"rgb", "masks"})
     box, bottle = drawn.masks[0, 0]
     half = box & (np.arange(260)[:, None] > np.median(np.nonzero(box)[0]))
     image = np.where((box | bottle)[..., None], drawn.rgb[0, 0], 0.2).astype(np.float32)
     exposed = np.ones(box.shape, bool)
-    photo = replace(taken.photo, image=image, well_exposed=exposed, masks={NAME: half, BEHIND: bottle})
-    *_, last = estimate_photo(models, [photo], (NAME, BEHIND), np.random.default_rng(0))
+    photo = replace(taken.photo, image=image, well_exposed=exposed, masks={NAME: half, BOTTLE: bottle})
+    *_, last = estimate_photo(models, [photo], (NAME, BOTTLE), np.random.default_rng(0))
     assert last.progress.total == 2 + 2 + 1
     for found, pose in zip(last.found, (front, behind), strict=True):
         assert np.rad2deg(rotation_angle(found.best.pose.quaternion, pose.quaternion)) < 5
@@ -192,19 +176,14 @@ def test_distinct_poses_are_the_best_and_differ():
 T_CAMERA_WORLD = Pose(np.array([0.05, -0.02, 0.8]), quaternion_exp(np.array([2.3, 0.2, 0.1])))
 
 
-@pytest.fixture(scope="module")
-def resting(fields):
-    return [resting_orientations(field) for field in fields.values()]
-
-
-def standing(resting, number, x, y):
-    turned = Pose(np.zeros(3), resting.quaternions[number])
-    return T_CAMERA_WORLD @ Pose(np.array([x, y, -resting.lowest(turned)]), turned.quaternion)
-
-
-def test_objects_that_stand_on_a_table_show_where_it_is(resting):
-    poses = [standing(r, k, 0.1 * k, -0.05 * k) for k, r in enumerate(resting)]
-    found = table_from_objects([TablePrior(r) for r in resting], poses)
+def test_objects_that_stand_on_a_table_show_where_it_is_but_not_one_alone(fields):
+    resting, poses = [resting_orientations(field) for field in fields.values()], []
+    for number, its in enumerate(resting):
+        turned = Pose(np.zeros(3), its.quaternions[number])
+        place = np.array([0.1 * number, -0.05 * number, -its.lowest(turned)])
+        poses.append(T_CAMERA_WORLD @ Pose(place, turned.quaternion))
+    assert table_from_objects([TablePrior(resting[0])], poses[:1]) is None
+    found = table_from_objects([TablePrior(its) for its in resting], poses)
     assert found.supported == (0, 1)
     table = T_CAMERA_WORLD.apply(np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3)) * [1, 1, 0])
     np.testing.assert_allclose(found.T_world_camera.apply(table)[:, 2], 0, atol=3e-3)
@@ -212,14 +191,8 @@ def test_objects_that_stand_on_a_table_show_where_it_is(resting):
     assert found.spread_deg < 2
 
 
-def test_one_object_alone_or_scattered_points_give_no_table(resting):
-    assert table_from_objects([TablePrior(resting[0])], [standing(resting[0], 0, 0, 0)]) is None
-    with pytest.raises(InvalidInput, check=about("points on one plane")):
-        table_from_points(np.random.default_rng(0).uniform(-1, 1, (500, 3)), np.random.default_rng(0))
-
-
 @pytest.mark.parametrize("seed", range(3))
-def test_points_on_the_table_get_height_zero_despite_outliers(seed):
+def test_points_on_the_table_get_height_zero_despite_outliers_and_scattered_ones_are_refused(seed):
     rng = np.random.default_rng(seed)
     T_camera_world = Pose(np.array([0.1, 0, 0.8]), quaternion_exp(np.array([2.4, 0.2 * rng.normal(), 0.1])))
     flat = np.concatenate([rng.uniform(-0.3, 0.3, (500, 2)), rng.normal(0, 1e-3, (500, 1))], axis=1)
@@ -227,3 +200,5 @@ def test_points_on_the_table_get_height_zero_despite_outliers(seed):
     found = table_from_points(points, rng)
     assert np.abs(found.apply(points[:500])[:, 2]).max() < 6e-3
     assert found.position[2] > 0.3  # the camera is above
+    with pytest.raises(InvalidInput, check=about("points on one plane")):
+        table_from_points(rng.uniform(-1, 1, (500, 3)), rng)
