@@ -5,7 +5,7 @@ as fields and write the sentence.
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -197,6 +197,31 @@ def check_seed(value: int) -> int:
     Raises:
         InvalidInput: if it is negative or has more than 63 bits.
     """
-    if not 0 <= value <= MAX_SEED:
-        raise InvalidInput("seed", value, f"between 0 and {MAX_SEED}")
+    check_ranges(("seed", value, 0, MAX_SEED))
     return int(value)
+
+
+def check_unique(what: str, names: Sequence[str], allowed: str = "without repetition") -> None:
+    """Refuse names of which two are equal.
+
+    Raises:
+        InvalidInput: if so.
+    """
+    if len(set(names)) != len(names):
+        raise InvalidInput(what, ", ".join(names), allowed)
+
+
+def check_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:
+    """Refuse names that do not exist.
+
+    Args:
+        kind: what they name, such as "object" or "camera".
+        names: what was given.
+        known: the names that exist.
+
+    Raises:
+        UnknownName: for the first that is not known.
+    """
+    for name in names:
+        if name not in known:
+            raise UnknownName(kind, name, known)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, finite_vector, shown
+from osfcore.errors import InvalidInput, check_ranges, finite_vector, shown
 from osfcore.geometry.poses import Pose, quaternion_from_matrix, rotate
 
 MIN_IMAGE_SIDE, MAX_IMAGE_SIDE = 16, 1024
@@ -24,8 +24,7 @@ def image_side(value: int, what: str = "image size [px]") -> int:
     Raises:
         InvalidInput: outside 16 to 1024.
     """
-    if not MIN_IMAGE_SIDE <= value <= MAX_IMAGE_SIDE:
-        raise InvalidInput(what, value, f"between {MIN_IMAGE_SIDE} and {MAX_IMAGE_SIDE}")
+    check_ranges((what, value, MIN_IMAGE_SIDE, MAX_IMAGE_SIDE))
     return int(value)
 
 

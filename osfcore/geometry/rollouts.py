@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, shown
+from osfcore.errors import InvalidInput, check_ranges, shown
 from osfcore.geometry.workspace import ACTION_ALLOWED, MAX_SPEED_M_S
 
 MAX_HORIZON = 200
@@ -63,14 +63,9 @@ def check_actions(actions: object) -> Float[np.ndarray, "K T 3"]:
         raise InvalidInput("actions [m/s]", shown(actions), allowed) from None
     if array.ndim != 3 or array.shape[2] != 3:
         raise InvalidInput("shape of the actions", array.shape, allowed)
-    count, horizon = array.shape[:2]
-    if not 1 <= horizon <= MAX_HORIZON:
-        raise InvalidInput("horizon [actions]", horizon, f"between 1 and {MAX_HORIZON}")
-    if not 1 <= count <= MAX_SEQUENCES:
-        raise InvalidInput("number of action sequences", count, f"between 1 and {MAX_SEQUENCES}")
-    is_sane = (
-        np.isfinite(array).all(axis=2) & (np.abs(array) <= MAX_SPEED_M_S + 1e-9).all(axis=2) & (array[..., 2] == 0)
-    )
+    check_ranges(("horizon [actions]", array.shape[1], 1, MAX_HORIZON))
+    check_ranges(("number of action sequences", len(array), 1, MAX_SEQUENCES))
+    is_sane = (np.abs(array) <= MAX_SPEED_M_S + 1e-9).all(axis=2) & (array[..., 2] == 0)  # false for NaN, too
     if not is_sane.all():
         k, t = np.argwhere(~is_sane)[0]
         raise InvalidInput(f"action {t} of sequence {k} [m/s]", array[k, t].tolist(), ACTION_ALLOWED)

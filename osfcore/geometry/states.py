@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from osfcore.errors import InvalidInput, UnknownName, finite_vector
+from osfcore.errors import InvalidInput, check_known, check_unique, finite_vector
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -41,8 +41,7 @@ class SceneState:
         count = len(self.names)
         if count > MAX_OBJECTS:
             raise InvalidInput("number of objects", count, f"at most {MAX_OBJECTS}")
-        if len(set(self.names)) != count:
-            raise InvalidInput("list of objects", ", ".join(self.names), "without repetition")
+        check_unique("list of objects", self.names)
         if self.poses.position.shape != (count, 3) or not np.all(np.isfinite(self.poses.position)):
             raise InvalidInput("object positions [m]", self.poses.position.tolist(), f"{count} x 3 finite numbers")
         quaternion = unit_quaternion(self.poses.quaternion, "object quaternions")
@@ -67,8 +66,7 @@ class SceneState:
         return replace(self, names=names, poses=self.poses[[self._number(name) for name in names]])
 
     def _number(self, name: str) -> int:
-        if name not in self.names:
-            raise UnknownName("object in the scene", name, self.names)
+        check_known("object in the scene", [name], self.names)
         return self.names.index(name)
 
 

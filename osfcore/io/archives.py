@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
-from osfcore.errors import CorruptFile, InvalidInput, OsfError
-from osfcore.io.files import folder_at_once, writing
+from osfcore.errors import CorruptFile, OsfError
+from osfcore.io.files import folder_at_once, new_folder, writing
 
 # The files that a zip lists are counted before the list is parsed: parsing takes memory and time for each.
 
@@ -26,7 +26,7 @@ _BYTES_PER_FILE = 512  # that a list may have: a long path and what zip tools no
 _SMALL_DIRECTORY_BYTES = 1 << 16  # below this no list hurts
 
 
-def check_directory(archive: BinaryIO, max_files: int) -> None:
+def _check_directory(archive: BinaryIO, max_files: int) -> None:
     """Refuse a zip whose list of files is too large or too long, whatever the archive claims of it.
 
     The list is sought where `zipfile` seeks it. A damaged one passes here, for `zipfile` refuses it.
@@ -45,7 +45,10 @@ def check_directory(archive: BinaryIO, max_files: int) -> None:
     if size > most:
         raise CorruptFile(archive.name, f"its list of files has {size} bytes; at most {most} are read")
     archive.seek(start)
-    count = _count_entries(archive.read(size))
+    data, count, place = archive.read(size), 0, 0
+    while len(data) - place >= _ENTRY_BYTES and data.startswith(_ENTRY, place):
+        place += _ENTRY_BYTES + sum(struct.unpack_from("<28xHHH", data, place))
+        count += 1
     if count > max_files:
         raise CorruptFile(archive.name, f"it holds {count} files; at most {max_files} are unpacked")
 
@@ -83,15 +86,6 @@ def _find_large_directory(archive: BinaryIO, end: int) -> tuple[int, int] | None
         return None
     length = struct.unpack_from("<40xQ", record)[0]
     return place - length, length
-
-
-def _count_entries(data: bytes) -> int:
-    """Return how many entries stand one behind the other."""
-    count = place = 0
-    while len(data) - place >= _ENTRY_BYTES and data.startswith(_ENTRY, place):
-        place += _ENTRY_BYTES + sum(struct.unpack_from("<28xHHH", data, place))
-        count += 1
-    return count
 
 
 MAX_BYTES = 2 << 30
@@ -173,7 +167,7 @@ def _opened(archive: Path, max_files: int) -> Iterator[zipfile.ZipFile]:
     """Open a zip whose list of files is not too long, and raise damage that is found in it as `CorruptFile`."""
     try:
         with archive.open("rb") as raw:
-            check_directory(raw, max_files)
+            _check_directory(raw, max_files)
             with zipfile.ZipFile(raw) as file:
                 yield file
     except OsfError:  # these are ValueErrors, too
@@ -204,9 +198,7 @@ def unpack(archive: Path, out: Path, kind: ArchiveKind, max_bytes: int = MAX_BYT
         InvalidInput: if `out` is there and not empty.
         CannotWrite: if the disk is full or cannot be written.
     """
-    archive, out = Path(archive), Path(out).absolute()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InvalidInput("output folder", out, "new or empty")
+    archive, out = Path(archive), new_folder(out)
     with _opened(archive, max_files) as file:
         wanted = _wanted(archive, _members(archive, file, kind, max_bytes), kind)
         with folder_at_once(out) as partial:

@@ -118,6 +118,18 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
 
 
+def new_folder(out: Path) -> Path:
+    """Return the absolute path of an output folder.
+
+    Raises:
+        InvalidInput: if there is something in its place other than an empty folder.
+    """
+    out = Path(out).absolute()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InvalidInput("output folder", out, "new or empty")
+    return out
+
+
 @contextlib.contextmanager
 def folder_at_once(out: Path) -> Iterator[Path]:
     """Give a folder beside `out` to fill, which takes that name only when everything is there and on the disk.

@@ -36,26 +36,11 @@ Split = Literal["train", "test"]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class AnnotatedImage:
-    """One image of a set.
-
-    Attributes:
-        path: of the PNG.
-        camera: its view; named after split and file, such as "train/0003.png".
-        light_direction: unit vector toward the light.
-    """
-
-    path: Path
-    camera: Camera
-    light_direction: Float[np.ndarray, "3"]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class ImageSet:
     """One split of a set, decoded; all its images have one size.
 
     Attributes:
-        cameras: n views, named after split and file.
+        cameras: n views, named after split and file, such as "train/0003.png".
         light_directions: unit vectors toward the light.
         rgba: straight alpha, as in the PNGs.
     """
@@ -79,30 +64,21 @@ class ImageSet:
         return bool(np.all(self.rgba[..., 3] == 255))
 
 
-def read_annotations(folder: Path, split: str) -> tuple[AnnotatedImage, ...]:
-    """Return the images of one split, after each was decoded and found sound.
-
-    Raises:
-        CorruptFile: if anything is missing or wrong; the message names the file and what is expected.
-    """
-    return tuple(image for image, _ in _images(Path(folder), split))
-
-
 def read_image_set(folder: Path, split: Split) -> ImageSet:
     """Return one split with its pixels. `read_splits` also compares the two.
 
     Raises:
         CorruptFile: if anything is missing or wrong; the message names the file and what is expected.
     """
-    images, pixels = zip(*_images(Path(folder), split), strict=True)
-    lights = np.array([image.light_direction for image in images], np.float32)
+    folder = Path(folder)
+    cameras, lights, pixels = zip(*_images(folder, split), strict=True)
     rgba = np.stack(pixels)
     opaque = np.all(rgba[..., 3] == 255, axis=(1, 2))
     if opaque.any() and not opaque.all():
-        place = images[int(np.argmax(opaque))].path if opaque.sum() * 2 < len(opaque) else Path(folder) / split
+        place = folder / (cameras[int(np.argmax(opaque))].name if opaque.sum() * 2 < len(opaque) else split)
         expected = "either all images have a silhouette (an object) or all are opaque (the table)"
         raise CorruptFile(place, f"{opaque.sum()} of {len(opaque)} images are opaque all over; {expected}")
-    return ImageSet(tuple(image.camera for image in images), lights, rgba)
+    return ImageSet(cameras, np.array(lights, np.float32), rgba)
 
 
 def read_splits(folder: Path) -> tuple[ImageSet, ImageSet]:
@@ -121,7 +97,8 @@ def read_splits(folder: Path) -> tuple[ImageSet, ImageSet]:
     return train, test
 
 
-def _images(folder: Path, split: str) -> Iterator[tuple[AnnotatedImage, UInt8[np.ndarray, "h w 4"]]]:
+def _images(folder: Path, split: Split) -> Iterator[tuple[Camera, Float[np.ndarray, "3"], UInt8[np.ndarray, "h w 4"]]]:
+    """Yield view, unit vector toward the light, and pixels of each image of a split."""
     path = folder / split / "anno.json"
     entries = _entries(folder, split, path)
     first_use: dict[Path, int] = {}
@@ -146,10 +123,10 @@ def _images(folder: Path, split: str) -> Iterator[tuple[AnnotatedImage, UInt8[np
         if rgba[..., 3].max() < OPAQUE:
             reason = "its mask is empty: it has no opaque pixel, so the object cannot be seen in it"
             raise CorruptFile(image_path, reason)
-        yield _annotated(path, number, entry, image_path, (width, height)), rgba
+        yield *_view(path, number, entry, (width, height)), rgba
 
 
-def _entries(folder: Path, split: str, path: Path) -> list[Any]:
+def _entries(folder: Path, split: Split, path: Path) -> list[Any]:
     try:
         if not path.is_file():
             expected = "an image set holds train/anno.json and test/anno.json"
@@ -165,7 +142,7 @@ def _entries(folder: Path, split: str, path: Path) -> list[Any]:
         raise CorruptFile(path, "it is not valid JSON") from error
     if not isinstance(entries, list) or not entries:
         raise CorruptFile(path, "it is not a list of images")
-    least = MIN_SPLIT.get(split, 1)
+    least = MIN_SPLIT[split]
     if not least <= len(entries) <= MAX_IMAGES:
         expected = f"between {least} and {MAX_IMAGES} are expected for {split}"
         raise CorruptFile(path, f"it lists {len(entries)} image{'s' * (len(entries) != 1)}; {expected}")
@@ -221,7 +198,9 @@ def _refuse_other_size(path: Path, number: int, entry: Mapping[str, Any], size: 
         raise CorruptFile(path.parent / shown(entry["filename"]), reason)
 
 
-def _annotated(path: Path, number: int, entry: Mapping[str, Any], image: Path, size: tuple[int, int]) -> AnnotatedImage:
+def _view(
+    path: Path, number: int, entry: Mapping[str, Any], size: tuple[int, int]
+) -> tuple[Camera, Float[np.ndarray, "3"]]:
     where = f"entry {number} ({shown(entry['filename'])})"
     RT = _numbers(path, where, entry, "RT", (3, 4))
     K = _numbers(path, where, entry, "K", (3, 3))
@@ -239,7 +218,7 @@ def _annotated(path: Path, number: int, entry: Mapping[str, Any], image: Path, s
         camera = Camera(f"{path.parent.name}/{entry['filename']}", T_camera_world.inverse(), K, *size)
     except InvalidInput as error:
         raise CorruptFile(path, str(error).rstrip(".")) from error
-    return AnnotatedImage(image, camera, light / length)
+    return camera, light / length
 
 
 def _numbers(path: Path, where: str, entry: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:

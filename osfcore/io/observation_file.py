@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 from pydantic import Field, FiniteFloat
 
-from osfcore.errors import CorruptFile, InvalidInput, UnknownName, finite_vector, shown
+from osfcore.errors import CorruptFile, InvalidInput, check_known, check_ranges, check_unique, finite_vector, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import MAX_OBJECTS, Observation
 from osfcore.io.files import is_file_name, leads_out, read_json, reading_png, write_json, writing
@@ -128,7 +128,7 @@ def _observation(folder: Path, data: object) -> Observation:
     cameras, names, files = tuple(c.camera() for c in entry.cameras), tuple(entry.objects), entry.images
     _check_cameras(cameras)
     _check_objects(names)
-    _check_known("camera", files, {camera.name for camera in cameras})
+    check_known("camera", files, {camera.name for camera in cameras})
     if missing := [camera.name for camera in cameras if camera.name not in files]:
         raise InvalidInput(f"image of camera {shown(missing[0])}", "missing", "given")
     taken = [str(files[camera.name]) for camera in cameras]
@@ -141,29 +141,18 @@ def _observation(folder: Path, data: object) -> Observation:
 
 
 def _check_cameras(cameras: tuple[Camera, ...]) -> None:
-    if not 1 <= len(cameras) <= MAX_CAMERAS:
-        raise InvalidInput("number of cameras", len(cameras), f"between 1 and {MAX_CAMERAS}")
-    names = [camera.name for camera in cameras]
-    if len(set(names)) != len(names):
-        raise InvalidInput("names of the cameras", ", ".join(names), "all different")
+    check_ranges(("number of cameras", len(cameras), 1, MAX_CAMERAS))
+    check_unique("names of the cameras", [camera.name for camera in cameras], "all different")
     sizes = [f"{camera.width} x {camera.height}" for camera in cameras]
     if len(set(sizes)) != 1:
         raise InvalidInput("sizes of the cameras [px]", ", ".join(sizes), "the same")
 
 
 def _check_objects(names: tuple[str, ...]) -> None:
-    if not 1 <= len(names) <= MAX_OBJECTS:
-        raise InvalidInput("number of objects", len(names), f"between 1 and {MAX_OBJECTS}")
+    check_ranges(("number of objects", len(names), 1, MAX_OBJECTS))
     if not all(names):
         raise InvalidInput("objects", list(names), "a list of names")
-    if len(set(names)) != len(names):
-        raise InvalidInput("list of objects", ", ".join(names), "without repetition")
-
-
-def _check_known(kind: str, given: Mapping[str, Any], known: set[str]) -> None:
-    for name in given:
-        if name not in known:
-            raise UnknownName(kind, name, known)
+    check_unique("list of objects", names)
 
 
 def _read_image(folder: Path, file: object, camera: Camera) -> Float32[np.ndarray, "h w 3"]:
@@ -177,11 +166,11 @@ def _read_image(folder: Path, file: object, camera: Camera) -> Float32[np.ndarra
 def _read_masks(
     folder: Path, by_camera: Mapping[str, Mapping[str, Any]], cameras: tuple[Camera, ...], names: tuple[str, ...]
 ) -> Bool[np.ndarray, "V N h w"]:
-    _check_known("camera", by_camera, {camera.name for camera in cameras})
+    check_known("camera", by_camera, {camera.name for camera in cameras})
     masks = np.zeros((len(cameras), len(names), cameras[0].height, cameras[0].width), bool)
     for view, camera in enumerate(cameras):
         files = by_camera.get(camera.name, {})
-        _check_known("object", files, set(names))
+        check_known("object", files, names)
         for name, file in files.items():
             path = _inside(folder, file, f"mask of {shown(name)} for camera {shown(camera.name)}")
             pixels = _read_png(path, camera, {_GREY: (1, 8)}, "8-bit grey, a single channel without transparency,")

@@ -100,11 +100,10 @@ class EpisodeFolder:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._adopt(settings)
-        except BlockingIOError:
+        except BaseException as error:
             self._lock.close()
-            raise InvalidInput("output file", out, "one that no other collection is writing") from None
-        except BaseException:
-            self._lock.close()
+            if isinstance(error, BlockingIOError):
+                raise InvalidInput("output file", out, "one that no other collection is writing") from None
             raise
 
     def __enter__(self) -> EpisodeFolder:
@@ -119,14 +118,11 @@ class EpisodeFolder:
             leftover.unlink()
         text = json.dumps(dict(settings), sort_keys=True)
         path = self._folder / "settings.json"
-        if path.exists() and path.read_text() != text:
-            raise InvalidInput(
-                f"the collection begun in {self._folder}",
-                "made with other settings",
-                "continued with the same settings, or its folder removed",
-            )
         if not path.exists():
             write_atomically(path, text.encode())
+        elif path.read_text() != text:
+            allowed = "continued with the same settings, or its folder removed"
+            raise InvalidInput(f"the collection begun in {self._folder}", "made with other settings", allowed)
         self._settings = text
 
     def path(self, index: int) -> Path:
@@ -161,9 +157,9 @@ def save_episode(path: Path, episode: PushEpisode) -> None:
     Raises:
         CannotWrite: if the disk refuses.
     """
-    arrays = _arrays(episode)
+    names = np.array(episode.names)
     with file_at_once(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, names=np.array(episode.names), seed=episode.seed, **arrays)
+        np.savez_compressed(file, allow_pickle=False, names=names, seed=episode.seed, **_arrays(episode))
 
 
 def load_episode(path: Path) -> PushEpisode:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, FiniteFloat, model_validator
 
-from osfcore.errors import InvalidInput, shown
+from osfcore.errors import InvalidInput, check_unique, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -44,7 +44,7 @@ class PointJson(Entry):
 
     @staticmethod
     def of(position: Float[np.ndarray, "3"]) -> PointJson:
-        """From an array."""
+        """Make one of an array."""
         return PointJson(position=position.tolist())
 
 
@@ -57,11 +57,11 @@ class ObjectJson(Entry):
 
     @staticmethod
     def of(name: str, pose: Pose) -> ObjectJson:
-        """From a name and a single pose."""
+        """Make one of a name and a single pose."""
         return ObjectJson(name=name, position=pose.position.tolist(), quaternion=pose.quaternion.tolist())
 
     def pose(self) -> Pose:
-        """The pose, its quaternion as it is given."""
+        """Return the pose, its quaternion as it is given."""
         return Pose(np.array(self.position), np.array(self.quaternion))
 
 
@@ -76,12 +76,12 @@ class CameraJson(Entry):
 
     @staticmethod
     def of(camera: Camera) -> CameraJson:
-        """From a camera."""
+        """Make one of a camera."""
         matrix, K = camera.T_world_camera.matrix().tolist(), camera.intrinsics.tolist()
         return CameraJson(name=camera.name, T_world_camera=matrix, K=K, width=camera.width, height=camera.height)
 
     def camera(self) -> Camera:
-        """The camera.
+        """Return the camera.
 
         Raises:
             InvalidInput: if a value is out of range.
@@ -91,7 +91,7 @@ class CameraJson(Entry):
 
 
 def rigid_pose(matrix: list[list[float]], camera: str) -> Pose:
-    """`T_world_camera` of a camera, as a matrix in a file.
+    """Return `T_world_camera` of a camera, given as a matrix in a file.
 
     Raises:
         InvalidInput: if it is no rotation and translation.
@@ -114,12 +114,12 @@ class StateJson(Entry):
 
     @staticmethod
     def of(state: SceneState) -> StateJson:
-        """From a state."""
+        """Make one of a state."""
         light = PointJson.of(state.light.position)
         return StateJson(objects=posed_objects(state), light=light, **pusher_of(state))
 
     def state(self) -> SceneState:
-        """The state.
+        """Return the state.
 
         Raises:
             InvalidInput: if a value is out of range.
@@ -138,27 +138,27 @@ class SceneJson(StateJson):
 
 
 def pusher_of(state: SceneState) -> dict[str, PointJson]:
-    """The pusher of a state, if there is one, by its key."""
+    """Return the pusher of a state, if there is one, by its key."""
     return {} if state.pusher is None else {"pusher": PointJson.of(state.pusher)}
 
 
 def posed_objects(state: SceneState) -> list[ObjectJson]:
-    """The objects of a state."""
+    """Return the objects of a state."""
     return [ObjectJson.of(name, state.pose(name)) for name in state.names]
 
 
 def state_to_json(state: SceneState) -> dict[str, Any]:
-    """A state as plain lists and numbers: a scene.json without cameras."""
+    """Return a state as plain lists and numbers: a scene.json without cameras."""
     return encode(StateJson.of(state))
 
 
 def scene_to_json(scene: Scene) -> dict[str, Any]:
-    """The scene as plain lists and numbers."""
+    """Return the scene as plain lists and numbers."""
     return {**state_to_json(scene.state), "cameras": [camera_to_json(camera) for camera in scene.cameras]}
 
 
 def scene_from_json(data: object) -> Scene:
-    """The scene of parsed JSON.
+    """Return the scene of parsed JSON.
 
     Raises:
         InvalidInput: if something is missing or out of range; the message names it.
@@ -168,24 +168,23 @@ def scene_from_json(data: object) -> Scene:
 
 
 def cameras_of(entries: Iterable[CameraJson]) -> tuple[Camera, ...]:
-    """The cameras.
+    """Return the cameras.
 
     Raises:
         InvalidInput: if a value is out of range, or two have the same name.
     """
     cameras = tuple(entry.camera() for entry in entries)
-    if len({camera.name for camera in cameras}) != len(cameras):
-        raise InvalidInput("names of the cameras", ", ".join(camera.name for camera in cameras), "all different")
+    check_unique("names of the cameras", [camera.name for camera in cameras], "all different")
     return cameras
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """One camera as plain lists and numbers."""
+    """Return one camera as plain lists and numbers."""
     return encode(CameraJson.of(camera))
 
 
 def camera_from_json(data: object) -> Camera:
-    """One camera of parsed JSON.
+    """Return one camera of parsed JSON.
 
     Raises:
         InvalidInput: if something is missing or out of range.
@@ -194,7 +193,7 @@ def camera_from_json(data: object) -> Camera:
 
 
 def read_scene(path: Path) -> Scene:
-    """The scene in a file.
+    """Return the scene in a file.
 
     Raises:
         CorruptFile: if it cannot be read or is not a scene; the message says why.
@@ -217,7 +216,7 @@ class _Actions(Entry):
 
 
 def actions_from_json(data: object) -> Float[np.ndarray, "K T 3"]:
-    """The sequences of actions of parsed JSON [m/s].
+    """Return the sequences of actions of parsed JSON [m/s].
 
     Raises:
         InvalidInput: if something is missing or out of range; the message names it.
@@ -229,7 +228,7 @@ def actions_from_json(data: object) -> Float[np.ndarray, "K T 3"]:
 
 
 def read_actions(path: Path) -> Float[np.ndarray, "K T 3"]:
-    """The sequences of actions in a file [m/s].
+    """Return the sequences of actions in a file [m/s].
 
     Raises:
         CorruptFile: if it cannot be read or holds no actions within the limits; the message says why.
@@ -238,7 +237,7 @@ def read_actions(path: Path) -> Float[np.ndarray, "K T 3"]:
 
 
 def rollouts_to_json(rollouts: Rollouts) -> dict[str, Any]:
-    """Rollouts as plain lists and numbers."""
+    """Return rollouts as plain lists and numbers."""
     arrays = {key: np.round(getattr(rollouts, key), _DIGITS).tolist() for key in ("positions", "quaternions", "pusher")}
     return {"names": list(rollouts.names), **arrays, "step_s": STEP_S}
 
@@ -251,7 +250,7 @@ class _Rollouts(Entry):
 
 
 def rollouts_from_json(data: object) -> Rollouts:
-    """The rollouts of parsed JSON.
+    """Return the rollouts of parsed JSON.
 
     Raises:
         InvalidInput: if something is missing or not a number; the message names it.
@@ -325,7 +324,7 @@ class EstimateJson(StateJson):
 
     @staticmethod
     def of_estimate(estimated: EstimatedState) -> EstimateJson:
-        """From an estimate."""
+        """Make one of an estimate."""
         state, light_std = estimated.state, LightUncertaintyJson(direction_std_rad=_bounded(estimated.light_std))
         deviations = zip(estimated.position_std, estimated.rotation_std, estimated.doubts, strict=True)
         return EstimateJson(
@@ -344,7 +343,7 @@ class EstimateJson(StateJson):
         )
 
     def estimate(self) -> EstimatedState:
-        """The estimate.
+        """Return the estimate.
 
         Raises:
             InvalidInput: if a value is out of range, or `trusted` and `reason` contradict each other.
@@ -368,12 +367,12 @@ def _unbounded(value: float | None) -> float:
 
 
 def estimated_to_json(estimated: EstimatedState) -> dict[str, Any]:
-    """The state as plain lists and numbers."""
+    """Return the state as plain lists and numbers."""
     return encode(EstimateJson.of_estimate(estimated))
 
 
 def estimated_from_json(data: object) -> EstimatedState:
-    """The state of parsed JSON.
+    """Return the state of parsed JSON.
 
     Raises:
         InvalidInput: if something is missing or out of range; the message names it.
@@ -387,7 +386,7 @@ def is_estimated(data: object) -> bool:
 
 
 def read_estimated(path: Path) -> EstimatedState:
-    """The state in a file; also of a scene.json.
+    """Return the state in a file; also of a scene.json.
 
     Raises:
         CorruptFile: if it cannot be read or is neither; the message says why.

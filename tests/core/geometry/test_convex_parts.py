@@ -1,3 +1,5 @@
+from itertools import product
+
 import numpy as np
 import pytest
 import trimesh
@@ -5,13 +7,7 @@ from scipy.spatial import ConvexHull
 
 from osfcore.errors import InvalidInput
 from osfcore.geometry.convex_parts import MAX_PARTS, MAX_VERTICES, convex_parts, dent_depth_m, reduced_hull
-from osfcore.objects.asset import TexturedMesh
-from osfcore.objects.mesh import textured_mesh
-
-
-def as_textured(mesh: trimesh.Trimesh) -> TexturedMesh:
-    uv = np.zeros((len(mesh.vertices), 2))
-    return textured_mesh(mesh.vertices, mesh.faces, uv, np.zeros((4, 4, 3), np.uint8), "mesh")
+from tests.support.same import assert_same
 
 
 def clearance_m(point, parts) -> float:
@@ -37,7 +33,6 @@ def test_points_in_a_plane_have_no_hull_and_no_parts():
 def test_reduced_hull_of_a_ball_cuts_off_little(radius):
     points = np.array(trimesh.creation.icosphere(4, radius).vertices)
     kept = reduced_hull(points)
-    assert kept is not None
     assert len(kept) <= MAX_VERTICES
     assert cut_m(points, kept) < 1.2e-3
     assert np.linalg.norm(kept, axis=1).max() < radius + 2e-3
@@ -46,29 +41,25 @@ def test_reduced_hull_of_a_ball_cuts_off_little(radius):
 def test_reduced_hull_keeps_a_box_exactly():
     box = trimesh.creation.box((0.1, 0.06, 0.04)).subdivide().subdivide()
     kept = reduced_hull(np.array(box.vertices))
-    assert kept is not None
-    assert {tuple(v) for v in kept.round(6)} >= {
-        (x, y, z) for x in (-0.05, 0.05) for y in (-0.03, 0.03) for z in (-0.02, 0.02)
-    }
+    corners = set(product((-0.05, 0.05), (-0.03, 0.03), (-0.02, 0.02)))
+    assert {tuple(v) for v in kept.round(6).tolist()} >= corners
     assert ConvexHull(kept).volume == pytest.approx(0.1 * 0.06 * 0.04)
 
 
 def test_dents_are_measured():
-    ball = as_textured(trimesh.creation.icosphere(4, 0.05))
+    ball = trimesh.creation.icosphere(4, 0.05)
     assert dent_depth_m(ball.vertices, ball.faces) < 2e-3
-    ring = as_textured(trimesh.creation.annulus(0.04, 0.05, 0.08))
+    ring = trimesh.creation.annulus(0.04, 0.05, 0.08)
     assert 0.025 < dent_depth_m(ring.vertices, ring.faces) < 0.045  # the middle of the lid is 40 mm from the ring
 
 
 @pytest.mark.slow
 def test_a_ring_stays_open_and_is_the_same_each_time():
-    ring = as_textured(trimesh.creation.annulus(0.04, 0.05, 0.05, sections=48))
+    ring = trimesh.creation.annulus(0.04, 0.05, 0.05, sections=48)
     parts = convex_parts(ring.vertices, ring.faces)
     assert 3 <= len(parts) <= MAX_PARTS
     assert clearance_m(np.zeros(3), parts) > 0.03
-    again = convex_parts(ring.vertices, ring.faces)
-    assert len(parts) == len(again)
-    assert all(np.array_equal(a, b) for a, b in zip(parts, again, strict=True))
+    assert_same(convex_parts(ring.vertices, ring.faces), parts)
 
 
 @pytest.mark.parametrize(

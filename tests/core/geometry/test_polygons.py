@@ -24,10 +24,6 @@ def rectangle(a: float, b: float, angle: float = 0.0, at=(0.0, 0.0)) -> torch.Te
     return (corners[(circle(COUNT) @ corners.T).argmax(dim=1)] + torch.tensor(at))[None]
 
 
-def disc(radius: float, at=(0.0, 0.0)) -> torch.Tensor:
-    return (radius * circle(COUNT) + torch.tensor(at))[None]
-
-
 def to_rectangle(point, a, b) -> float:
     """Signed distance of a point from a rectangle around the origin."""
     away = np.abs(point) - [a, b]
@@ -101,13 +97,12 @@ def test_a_dent_does_not_tear_outlines_apart():
 
 def test_many_outlines_are_looked_at_independently():
     outlines = torch.cat([rectangle(0.05, 0.03, 0.2 * k, (0.02 * k, 0.0)) for k in range(5)])
-    others = torch.cat([disc(0.02, (0.1, 0.03 * k)) for k in range(5)])
+    others = 0.02 * circle(COUNT) + torch.tensor([[[0.1, 0.03 * k]] for k in range(5)])
     together = gap_between(outlines, others)
     assert gap_between(outlines[:0], others[:0]).distance.shape == (0,)
     points = gap_to_point(outlines, others[:, 0])
     for k in range(5):
         alone = gap_between(outlines[k : k + 1], others[k : k + 1])
         torch.testing.assert_close(together.distance[k], alone.distance[0])
-        torch.testing.assert_close(
-            points.distance[k], gap_to_point(outlines[k : k + 1], others[k : k + 1, 0]).distance[0]
-        )
+        one = gap_to_point(outlines[k : k + 1], others[k : k + 1, 0])
+        torch.testing.assert_close(points.distance[k], one.distance[0])

@@ -72,9 +72,8 @@ def test_random_lights_are_uniform_on_the_hemisphere_above_ten_degrees():
     heights = np.array([Light.random(rng).direction[2] for _ in range(4000)])
     low = np.sin(np.deg2rad(10))
     assert heights.min() >= low
-    np.testing.assert_allclose(
-        np.quantile(heights, [0.25, 0.5, 0.75]), low + (1 - low) * np.array([0.25, 0.5, 0.75]), atol=0.02
-    )
+    quarters = np.array([0.25, 0.5, 0.75])
+    np.testing.assert_allclose(np.quantile(heights, quarters), low + (1 - low) * quarters, atol=0.02)
 
 
 @pytest.mark.parametrize("action", [[0.301, 0, 0], [0, 0, 0.01], [np.inf, 0, 0], [0, 0], None, [[0, 0, 0]]])
@@ -85,9 +84,9 @@ def test_actions_beyond_are_refused(action):
 
 
 def state(names=("a",), positions=None, quaternions=None, pusher=None) -> SceneState:
-    count = len(names)
-    positions = np.zeros((count, 3)) if positions is None else np.array(positions)
-    quaternions = np.tile([1.0, 0, 0, 0], (count, 1)) if quaternions is None else np.array(quaternions)
+    poses = Pose.identity(len(names))
+    positions = poses.position if positions is None else np.array(positions)
+    quaternions = poses.quaternion if quaternions is None else np.array(quaternions)
     return SceneState(tuple(names), Pose(positions, quaternions), OVERHEAD, pusher)
 
 
@@ -117,8 +116,7 @@ def test_objects_are_put_in_another_order():
         both.reordered(("b", "c"))
 
 
-STATE = SceneState(("a", "b"), Pose.identity(2), Light(np.array([0, 0, 1.0])), None)
-GOOD = {"state": STATE, "position_std": np.array([0.001, np.inf]), "rotation_std": np.zeros(2), "light_std": 0.0,
+GOOD = {"state": state("ab"), "position_std": np.array([0.001, np.inf]), "rotation_std": np.zeros(2), "light_std": 0.0,
         "doubts": ("", ""), "reason": ""}  # fmt: skip
 
 

@@ -13,15 +13,11 @@ def path(tmp_path):
     return path
 
 
-def test_a_run_goes_on_from_its_own_checkpoint(path):
-    taken = []
+@pytest.mark.parametrize("damage", ["missing", "cut short", "rubbish", "empty", "of another run", "no checkpoint"])
+def test_a_run_goes_on_from_its_own_checkpoint_and_starts_over_where_there_is_none(path, damage):
+    taken, data = [], path.read_bytes()
     resume_from(path, "this run", taken.append)
     assert [(content["done"], float(content["weights"][-1])) for content in taken] == [(7, 999.0)]
-
-
-@pytest.mark.parametrize("damage", ["missing", "cut short", "rubbish", "empty", "of another run", "no checkpoint"])
-def test_a_run_starts_over_where_there_is_nothing_to_go_on_from(path, damage):
-    data = path.read_bytes()
     if damage == "missing":
         path.unlink()
     elif damage == "of another run":
@@ -30,20 +26,13 @@ def test_a_run_starts_over_where_there_is_nothing_to_go_on_from(path, damage):
         torch.save([1, 2], path)
     else:
         path.write_bytes({"cut short": data[: len(data) // 2], "rubbish": b"rubbish", "empty": b""}[damage])
-    taken = []
     resume_from(path, "this run", taken.append)
-    assert taken == []
+    assert len(taken) == 1
 
 
 def test_a_checkpoint_that_is_taken_over_by_half_ends_the_run_and_stays(path):
-    taken = []
-
-    def restore(content):
-        taken.append(content["done"])
-        taken.append(content["optimiser"])
-
     with pytest.raises(CorruptFile, check=about("net.checkpoint")):
-        resume_from(path, "this run", restore)
+        resume_from(path, "this run", lambda content: content["optimiser"])
     assert path.exists()
     with pytest.raises(CorruptFile):  # what cannot be read is not taken for none
         resume_from(path.parent, "this run", print)

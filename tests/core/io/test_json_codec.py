@@ -1,5 +1,4 @@
 import pytest
-from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput
 from osfcore.io.json_codec import Entry, Matrix3, Text, Vector3, decode, encode
@@ -14,9 +13,6 @@ class Whole(Entry):
     parts: list[Part]
     K: Matrix3 | None = None
     is_new: bool = False
-
-
-finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
 def test_members_that_nobody_knows_are_left_alone():
