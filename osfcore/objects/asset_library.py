@@ -14,10 +14,11 @@ import json
 import re
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -36,25 +37,17 @@ _NAME = re.compile(r"(?=[\w.-]*[\d_])[\w.-]*\w")  # a whole word with a digit or
 _TEMPORARY_LIFE_S = 600  # far longer than one write takes; older ones were left by a killed process
 
 
+@dataclass(frozen=True)
 class AssetLibrary:
     """The objects in one folder.
 
     Several processes may read and write at once: readers see whole objects only.
 
-    Args:
+    Attributes:
         root: the folder, usually DATA_DIR/objects; made at the first write.
     """
 
-    def __init__(self, root: Path) -> None:
-        self.root = Path(root)
-
-    def __eq__(self, other: object) -> bool:
-        """Whether both are of the same folder."""
-        return isinstance(other, AssetLibrary) and self.root == other.root
-
-    def __hash__(self) -> int:
-        """Return a hash of the folder."""
-        return hash(self.root)
+    root: Path
 
     def names(self) -> tuple[str, ...]:
         """Return the names of all objects that can be loaded, sorted."""
@@ -115,8 +108,6 @@ class AssetLibrary:
             UnknownName: if there is no such object.
             CorruptFile: if its files are damaged.
         """
-        import cv2
-
         with self._reading(name) as facts:
             arrays = self._arrays(name, facts)
             png = np.frombuffer(self._checked(name, _TEXTURE, facts), np.uint8)
@@ -172,11 +163,8 @@ class AssetLibrary:
         Raises:
             FetchFailed: if the disk is full or the folder cannot be written; nothing is changed.
         """
-        files = {
-            _ARRAYS: _array_bytes(asset),
-            _TEXTURE: encode_png(asset.mesh.texture),
-            _VIEWER: viewer_glb(asset.mesh),
-        }
+        mesh = asset.mesh
+        files = {_ARRAYS: _array_bytes(asset), _TEXTURE: encode_png(mesh.texture), _VIEWER: viewer_glb(mesh)}
         facts = {
             "format_version": FORMAT_VERSION,
             "info": asdict(asset.info),
@@ -267,7 +255,7 @@ def _is_plain(name: str) -> bool:
 
 
 def check_name(name: str) -> str:
-    """A name that a user's object may have.
+    """Return a name after checking that a user's object may have it.
 
     Raises:
         InvalidInput: if it is not 1 to 64 lower-case letters, digits, "_" and "-", the first a letter or digit.

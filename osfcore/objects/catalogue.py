@@ -54,16 +54,5 @@ CATALOGUE: Mapping[str, ObjectInfo] = MappingProxyType(
     {name: ObjectInfo(name, label, mass, symmetry, LICENCE, ATTRIBUTION) for name, label, mass, symmetry in _ROWS}
 )
 
-DEFAULT_NAMES: tuple[str, ...] = (
-    "002_master_chef_can",
-    "003_cracker_box",
-    "004_sugar_box",
-    "005_tomato_soup_can",
-    "006_mustard_bottle",
-    "007_tuna_fish_can",
-    "008_pudding_box",
-    "009_gelatin_box",
-    "010_potted_meat_can",
-    "035_power_drill",
-)
-"""The objects that the package on PyPI holds."""
+DEFAULT_NAMES: tuple[str, ...] = (*(name for name in CATALOGUE if name < "011"), "035_power_drill")
+"""The objects that the package on PyPI holds: 002 to 010 and the drill."""

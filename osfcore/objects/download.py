@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -176,8 +177,7 @@ def _pip_reason(log: str) -> str:
         return f"{sys.executable} has no pip; install it with 'python -m ensurepip'"
     if "No space left" in log:
         return "the disk is full (No space left on device)"
-    connection_words = ("NewConnectionError", "NameResolutionError", "ConnectTimeout", "Read timed out", "ProxyError")
-    if any(word in log for word in connection_words):
+    if re.search("NewConnectionError|NameResolutionError|ConnectTimeout|Read timed out|ProxyError", log):
         return "the package index cannot be reached; check the network and the proxy settings of pip"
-    lines = [line.removeprefix("ERROR: ") for line in log.splitlines() if line.startswith("ERROR: ")]
-    return "pip says: " + (lines[-1].rstrip(".") if lines else "nothing")
+    said = re.findall("^ERROR: (.*)", log, flags=re.MULTILINE)
+    return "pip says: " + (said[-1].rstrip(".") if said else "nothing")

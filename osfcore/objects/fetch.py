@@ -6,15 +6,15 @@ import hashlib
 import math
 import zipfile
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 from urllib.parse import urlsplit
 
-from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, UnknownName, WorkerDied
+from osfcore.errors import CorruptFile, FetchFailed, InvalidInput, UnknownName, WorkerDied, check_known
 from osfcore.io.files import put_in_place
 from osfcore.objects.asset import ObjectAsset, ObjectInfo, Symmetry, TexturedMesh
 from osfcore.objects.asset_library import AssetLibrary, check_name
@@ -28,30 +28,18 @@ from osfcore.progress import Progress
 _LAYOUTS = ("{name}/google_16k/textured.obj", "{name}/textured.obj")
 
 
-@dataclass(frozen=True, slots=True)
-class MeshFiles:
-    """Files of one object on this machine.
+class Source(ABC):
+    """A place that meshes can be fetched from.
 
     Attributes:
-        mesh: .msh, or any format that `read_mesh` reads.
-        texture: image that belongs to a .msh; other formats name theirs themselves.
+        label: its name in messages and in the objects' records.
     """
 
-    mesh: Path
-    texture: Path | None = None
-
-
-class Source(Protocol):
-    """A place that meshes can be fetched from."""
-
-    @property
-    def label(self) -> str:
-        """Its name in messages and in the objects' records."""
-        ...
+    label: str
 
     def names(self) -> tuple[str, ...]:
-        """Objects that are fetched when none are named."""
-        ...
+        """Return the objects that are fetched when none are named; the default ten where a source cannot list any."""
+        return DEFAULT_NAMES
 
     def prepare(self) -> Iterator[Progress]:
         """Do what is needed once for all objects; steps count from 0 to their own total.
@@ -59,20 +47,22 @@ class Source(Protocol):
         Raises:
             FetchFailed: if that is not possible.
         """
-        ...
+        yield Progress(1, 1, f"Reading {self.label}")
 
-    def files(self, name: str, folder: Path) -> MeshFiles:
-        """Return the files of one object, put into `folder` if they do not lie on this machine already.
+    @abstractmethod
+    def mesh(self, name: str, folder: Path) -> Path:
+        """Return the mesh of one object, put into `folder` if it does not lie on this machine already.
+
+        It is of any format that `read_mesh` reads, or a .msh with its texture beside it as .png.
 
         Raises:
             UnknownName: if this source does not have it.
             FetchFailed: if it cannot be downloaded.
             CorruptFile: if an archive is damaged.
         """
-        ...
 
 
-class WheelSource:
+class WheelSource(Source):
     """Ten YCB objects from the wheel of MyoSuite on PyPI, downloaded with pip, never installed or imported.
 
     Args:
@@ -84,23 +74,11 @@ class WheelSource:
     SHA256 = "e974ae1eacf674d17a72a09153e06a256c795e7f6c5f76d8c4686ca71bab7558"
     BYTES = 85_000_000  # about; only for the progress bar
     FOLDER = "myosuite/simhive/YCB_sim"
+    label = f"{REQUIREMENT} from PyPI"
 
     def __init__(self, cache: Path) -> None:
         self._cache = Path(cache)
-
-    @property
-    def label(self) -> str:
-        """The package and where it is from."""
-        return f"{self.REQUIREMENT} from PyPI"
-
-    @property
-    def wheel(self) -> Path:
-        """Path of the wheel in the cache."""
-        return self._cache / self.FILE
-
-    def names(self) -> tuple[str, ...]:
-        """The ten objects of the wheel."""
-        return DEFAULT_NAMES
+        self.wheel = self._cache / self.FILE
 
     def prepare(self) -> Iterator[Progress]:
         """Download and verify the wheel unless the cache has it.
@@ -133,21 +111,20 @@ class WheelSource:
             self._cache.mkdir(parents=True, exist_ok=True)
             put_in_place(path, self.wheel)
 
-    def files(self, name: str, folder: Path) -> MeshFiles:
-        """Return mesh and texture of one object, taken out of the wheel."""
-        if name not in DEFAULT_NAMES:
-            raise UnknownName(f"object in {self.label}", name, DEFAULT_NAMES)
-        mesh, texture = folder / f"{name}.msh", folder / f"{name}.png"
+    def mesh(self, name: str, folder: Path) -> Path:
+        """Return the mesh of one object, taken out of the wheel with its texture."""
+        check_known(f"object in {self.label}", [name], DEFAULT_NAMES)
+        mesh = folder / f"{name}.msh"
         try:
             with raising_fetch_failed(name, folder), zipfile.ZipFile(self.wheel) as wheel:
                 mesh.write_bytes(wheel.read(f"{self.FOLDER}/meshes/{name}.msh"))
-                texture.write_bytes(wheel.read(f"{self.FOLDER}/textures/{name}.png"))
+                mesh.with_suffix(".png").write_bytes(wheel.read(f"{self.FOLDER}/textures/{name}.png"))
         except (zipfile.BadZipFile, zlib.error, KeyError) as error:
             raise CorruptFile(self.wheel, f"it does not hold {name}") from error
-        return MeshFiles(mesh, texture)
+        return mesh
 
 
-class FolderSource:
+class FolderSource(Source):
     """A folder in the layout of the YCB downloads: NAME/google_16k/textured.obj, or NAME/textured.obj.
 
     Args:
@@ -161,14 +138,10 @@ class FolderSource:
         self._folder = Path(folder).expanduser()
         if not self._folder.is_dir():
             raise InvalidInput("source", folder, "'pypi', a folder that exists or an http(s) address")
-
-    @property
-    def label(self) -> str:
-        """The folder."""
-        return str(self._folder.resolve())
+        self.label = str(self._folder.resolve())
 
     def names(self) -> tuple[str, ...]:
-        """The catalogue's objects that the folder holds.
+        """Return the catalogue's objects that the folder holds.
 
         Raises:
             InvalidInput: if it holds none.
@@ -179,17 +152,13 @@ class FolderSource:
             raise InvalidInput("source", self._folder, allowed)
         return available
 
-    def prepare(self) -> Iterator[Progress]:
-        """Nothing is needed."""
-        yield Progress(1, 1, f"Reading {self._folder}")
-
-    def files(self, name: str, folder: Path) -> MeshFiles:
-        """The mesh where it lies."""
+    def mesh(self, name: str, folder: Path) -> Path:
+        """Return the mesh where it lies."""
         del folder  # nothing has to be copied
         path = _mesh_in(self._folder, name)
         if path is None:
             raise UnknownName(f"object in {self._folder}", name, (n for n in CATALOGUE if _mesh_in(self._folder, n)))
-        return MeshFiles(path)
+        return path
 
 
 def _mesh_in(folder: Path, name: str) -> Path | None:
@@ -198,7 +167,7 @@ def _mesh_in(folder: Path, name: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-class UrlSource:
+class UrlSource(Source):
     """A web address with the official archives (NAME_google_16k.tgz) or with the folder layout of `FolderSource`.
 
     Args:
@@ -217,23 +186,10 @@ class UrlSource:
             is_address = False
         if not is_address:
             raise InvalidInput("source", repr(base), "an address that starts with http:// or https://")
-        self._base = base.rstrip("/")
+        self.label = self._base = base.rstrip("/")
         self._cache = Path(cache) / "archives" / hashlib.sha256(self._base.encode()).hexdigest()[:16]
 
-    @property
-    def label(self) -> str:
-        """The address."""
-        return self._base
-
-    def names(self) -> tuple[str, ...]:
-        """The default ten, for a web server does not list what it has."""
-        return DEFAULT_NAMES
-
-    def prepare(self) -> Iterator[Progress]:
-        """Nothing is needed."""
-        yield Progress(1, 1, f"Reading {self._base}")
-
-    def files(self, name: str, folder: Path) -> MeshFiles:
+    def mesh(self, name: str, folder: Path) -> Path:
         """Return the mesh of one object, from its archive or from single files, whichever the server has."""
         archive = self._archive(name)
         if archive is not None:
@@ -246,7 +202,7 @@ class UrlSource:
             if path is None:
                 archive.unlink(missing_ok=True)
                 raise CorruptFile(archive.name, f"it holds no {name}/google_16k/textured.obj")
-            return MeshFiles(path)
+            return path
         for layout in _LAYOUTS:
             address = f"{self._base}/{layout.format(name=name)}"
             if download(address, folder / "textured.obj"):
@@ -255,7 +211,7 @@ class UrlSource:
                     if download(f"{base}/{library}", folder / library):
                         for image in _named(folder / library, "map_Kd"):
                             download(f"{base}/{image}", folder / image)
-                return MeshFiles(folder / "textured.obj")
+                return folder / "textured.obj"
         raise FetchFailed(name, f"{self._base} has neither {name}_google_16k.tgz nor {_LAYOUTS[0].format(name=name)}")
 
     def _archive(self, name: str) -> Path | None:
@@ -327,80 +283,70 @@ def fetch(
         FetchFailed: without network or disk space.
         CorruptFile: if a file of the source is damaged.
     """
-    for name in names:
-        if name not in CATALOGUE:
-            raise UnknownName("object in the catalogue", name, CATALOGUE)
+    check_known("object in the catalogue", names, CATALOGUE)
     chosen = list(dict.fromkeys(names or source.names()))
     missing = [name for name in chosen if force or not library.has(name)]
-    total = len(chosen) + 1
-    here = len(chosen) - len(missing)
+    objects, total = len(chosen), len(chosen) + 1
+    done = objects - len(missing)
     if not missing:
-        yield Progress(total, total, f"All {len(chosen)} objects are here already")
+        yield Progress(total, total, f"All {objects} objects are here already")
         return
-    yield Progress(here, total, f"Preparing {source.label}")
+    yield Progress(done, total, f"Preparing {source.label}")
     for step in source.prepare():
-        yield Progress(here, total, step.note)
-    with temporary_folder(library.root, "objects") as folder:
-        yield from _convert_all(missing, source, library, executor, folder, here + 1, total)
-    yield Progress(total, total, f"{len(chosen)} objects ready")
-
-
-def _convert_all(
-    names: list[str],
-    source: Source,
-    library: AssetLibrary,
-    executor: Executor | None,
-    folder: Path,
-    done: int,
-    total: int,
-) -> Iterator[Progress]:
+        yield Progress(done, total, step.note)
+    done += 1
     running: dict[Future[None], str] = {}
-    objects = total - 1
-    try:
-        for name in names:
-            label = CATALOGUE[name].label.lower()
-            note = f"{{}} {label} ({done + len(running)} of {objects})"
-            yield Progress(done, total, note.format("Getting"))
-            place = folder / name
-            with raising_fetch_failed(name, folder):
-                place.mkdir()
-            files = source.files(name, place)
-            yield Progress(done, total, note.format("Converting"))
-            if executor is None:
-                convert(files, CATALOGUE[name], library, source.label)
-                done += 1
-                continue
-            running[executor.submit(convert, files, CATALOGUE[name], library, source.label)] = label
-        while running:
-            finished, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in finished:
-                label = running.pop(future)
-                future.result()
-                done += 1
-                yield Progress(done, total, f"Converted {label} ({done - 1} of {objects})")
-    except BrokenProcessPool as error:  # when a result is taken, or already when the next object is handed over
-        raise WorkerDied("converting objects") from error
-    finally:
-        for future in running:
-            future.cancel()
-        wait(running)  # those that run already would lose their input with the folder
+    with temporary_folder(library.root, "objects") as folder:
+        try:
+            for name in missing:
+                label = CATALOGUE[name].label.lower()
+                note = f"{{}} {label} ({done + len(running)} of {objects})"
+                yield Progress(done, total, note.format("Getting"))
+                with raising_fetch_failed(name, folder):
+                    (folder / name).mkdir()
+                path = source.mesh(name, folder / name)
+                yield Progress(done, total, note.format("Converting"))
+                if executor is None:
+                    convert(path, CATALOGUE[name], library, source.label)
+                    done += 1
+                else:
+                    running[executor.submit(convert, path, CATALOGUE[name], library, source.label)] = label
+            while running:
+                finished, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    label = running.pop(future)
+                    future.result()
+                    done += 1
+                    yield Progress(done, total, f"Converted {label} ({done - 1} of {objects})")
+        except BrokenProcessPool as error:  # when a result is taken, or already when the next object is handed over
+            raise WorkerDied("converting objects") from error
+        finally:
+            for future in running:
+                future.cancel()
+            wait(running)  # those that run already would lose their input with the folder
+    yield Progress(total, total, f"{objects} objects ready")
 
 
-def convert(files: MeshFiles, info: ObjectInfo, library: AssetLibrary, source: str) -> None:
-    """Read one object's files, make its collision parts and resting orientations, and write it.
+def convert(path: Path, info: ObjectInfo, library: AssetLibrary, source: str) -> None:
+    """Read one object's mesh, make its collision parts and resting orientations, and write it.
 
     Args:
-        files: mesh and texture.
+        path: of the mesh, as `Source.mesh` returns it.
         info: the catalogue's facts about the object.
         library: where it goes, over an older one of that name.
-        source: where the files came from, for people.
+        source: where the mesh came from, for people.
 
     Raises:
         CorruptFile: if a file is damaged.
         InvalidInput: if the mesh is not of a tabletop object's size, or encloses no volume.
         FetchFailed: if the disk is full.
     """
-    library.write(make_asset(_read(files), info), source)
+    from osfcore.objects.mesh import PLAIN_SIDE, read_mesh, read_msh
+
+    mesh = read_msh(path) if path.suffix == ".msh" else read_mesh(path)
+    if max(mesh.texture.shape) <= PLAIN_SIDE:
+        raise CorruptFile(path, "the image of its texture is missing")
+    library.write(make_asset(mesh, info), source)
 
 
 def make_asset(mesh: TexturedMesh, info: ObjectInfo) -> ObjectAsset:
@@ -482,20 +428,3 @@ def add_object(mesh_path: Path, new: NewObject, library: AssetLibrary, *, force:
     asset = make_asset(read_mesh(Path(mesh_path), new.scale), new.info)
     library.write(asset, str(mesh_path))
     return asset
-
-
-def _read(files: MeshFiles) -> TexturedMesh:
-    from osfcore.objects.mesh import PLAIN_SIDE, read_mesh, read_msh, textured_mesh
-
-    if files.mesh.suffix != ".msh":
-        mesh = read_mesh(files.mesh)
-        if max(mesh.texture.shape) <= PLAIN_SIDE:
-            raise CorruptFile(files.mesh, "the image of its texture is missing")
-        return mesh
-    import cv2
-
-    raw = read_msh(files.mesh)
-    image = cv2.imread(str(files.texture)) if files.texture else None
-    if image is None:
-        raise CorruptFile(files.texture or files.mesh, "its texture cannot be read")
-    return textured_mesh(raw.vertices, raw.faces, raw.uv, image[..., ::-1], files.mesh)

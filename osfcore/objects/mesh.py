@@ -72,12 +72,9 @@ def piece_of(mesh: trimesh.Trimesh) -> TexturedPiece:
             return _unrepeated(TexturedPiece(vertices, faces, np.asarray(uv, float), texture))
         colour = _rgb(material.main_color) * 255
     elif visual.kind in ("vertex", "face"):
-        corner_colours = (
-            np.asarray(visual.vertex_colors)[faces]
-            if visual.kind == "vertex"
-            else np.repeat(np.asarray(visual.face_colors)[:, None], 3, axis=1)
-        )
-        return _baked(vertices, faces, corner_colours[..., :3].astype(float))
+        by_face = np.repeat(np.asarray(visual.face_colors)[:, None], 3, axis=1) if visual.kind == "face" else None
+        colours = np.asarray(visual.vertex_colors)[faces] if by_face is None else by_face
+        return _baked(vertices, faces, colours[..., :3].astype(float))
     else:
         colour = np.array(_GREY)
     texture = np.broadcast_to(np.round(colour).astype(np.uint8), (PLAIN_SIDE, PLAIN_SIDE, 3)).copy()
@@ -199,20 +196,15 @@ def unpack_mesh(file: Path, out: Path) -> Path:
     if check_upload(file):
         out.mkdir()
         return file.rename(out / "mesh.glb")
-    inside = _mesh_in(file)
-    kind = ArchiveKind("mesh", inside, (), _EXPECTED)
-    return unpack(file, out, kind, MAX_UNPACKED_BYTES, MAX_FILES) / inside
-
-
-def _mesh_in(archive: Path) -> PurePosixPath:
-    with zipfile.ZipFile(archive) as file:
-        paths = [PurePosixPath(name.replace("\\", "/")) for name in file.namelist()]
+    with zipfile.ZipFile(file) as archive:
+        paths = [PurePosixPath(name.replace("\\", "/")) for name in archive.namelist()]
     meshes = [p for p in paths if p.suffix.lower() in _SUFFIXES and p.name[0] != "." and p.parts[0] != "__MACOSX"]
     if not meshes:
-        raise CorruptFile(archive, f"it holds no mesh; send {_EXPECTED}")
+        raise CorruptFile(file, f"it holds no mesh; send {_EXPECTED}")
     if len(meshes) > 1:
-        raise CorruptFile(archive, f"it holds {len(meshes)} meshes, {meshes[0]} and {meshes[1]} among them; send one")
-    return meshes[0]
+        raise CorruptFile(file, f"it holds {len(meshes)} meshes, {meshes[0]} and {meshes[1]} among them; send one")
+    kind = ArchiveKind("mesh", meshes[0], (), _EXPECTED)
+    return unpack(file, out, kind, MAX_UNPACKED_BYTES, MAX_FILES) / meshes[0]
 
 
 class UnpackedFiles(Resolver):
@@ -364,26 +356,12 @@ _HEADER_BYTES = 16
 _MAX_COUNT = 10_000_000
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class MshMesh:
-    """The contents of a .msh file.
-
-    Attributes:
-        vertices: as in the file, [m] for the objects used here.
-        uv: texture coordinates with v upwards.
-        faces: vertex indices.
-    """
-
-    vertices: Float[np.ndarray, "P 3"]
-    uv: Float[np.ndarray, "P 2"]
-    faces: Int[np.ndarray, "F 3"]
-
-
-def read_msh(path: Path) -> MshMesh:
-    """Read a MuJoCo .msh file that has one texture coordinate a vertex; its normals are left out.
+def read_msh(path: Path) -> TexturedMesh:
+    """Read a MuJoCo .msh file [m] that has one texture coordinate a vertex, with its texture beside it as .png.
 
     Raises:
-        CorruptFile: if the counts do not fit the length of the file or each other.
+        CorruptFile: if the counts do not fit the length of the file or each other, or the texture cannot be read.
+        InvalidInput: as `textured_mesh`.
     """
     data = path.read_bytes()
     if len(data) < _HEADER_BYTES:
@@ -400,7 +378,10 @@ def read_msh(path: Path) -> MshMesh:
     uv = floats[-2 * texcoords :].reshape(-1, 2).astype(np.float32)
     uv[:, 1] = 1 - uv[:, 1]
     indices = np.frombuffer(data, "<i4", 3 * faces, expected - 12 * faces).reshape(-1, 3)
-    return MshMesh(floats[: 3 * vertices].reshape(-1, 3).astype(np.float32), uv, indices.astype(np.int32))
+    image = cv2.imread(str(path.with_suffix(".png")))
+    if image is None:
+        raise CorruptFile(path.with_suffix(".png"), "its texture cannot be read")
+    return textured_mesh(floats[: 3 * vertices].reshape(-1, 3), indices, uv, image[..., ::-1], path)
 
 
 # Orientations in which an object comes to rest on a plane.

@@ -82,21 +82,15 @@ def test_archives_unpack_unless_to_too_much(tmp_path):
         unpack(path, tmp_path / "again", max_bytes=1_000_000)
 
 
-@pytest.mark.parametrize("damage", ["empty", "garbage", "truncated", "flipped"])
-def test_damaged_archives_are_told(tmp_path, damage):
+def test_damaged_archives_are_refused(tmp_path):
     path = archive(tmp_path / "a.tgz", [(tarfile.TarInfo("x"), os.urandom(5000))])
     data = path.read_bytes()
     middle = len(data) // 2
-    path.write_bytes(
-        {
-            "empty": b"",
-            "garbage": b"no archive" * 100,
-            "truncated": data[:middle],
-            "flipped": data[:middle] + bytes([data[middle] ^ 255]) + data[middle + 1 :],
-        }[damage]
-    )
-    with pytest.raises(CorruptFile, check=about("a.tgz")):
-        unpack(path, tmp_path / "out")
+    flipped = data[:middle] + bytes([data[middle] ^ 255]) + data[middle + 1 :]
+    for damaged in (b"", b"no archive" * 100, data[:middle], flipped):
+        path.write_bytes(damaged)
+        with pytest.raises(CorruptFile, check=about("a.tgz")):
+            unpack(path, tmp_path / "out")
 
 
 def test_temporary_folders_vanish_and_take_old_ones_along(tmp_path):
@@ -113,14 +107,11 @@ def test_pip_takes_a_wheel_from_a_folder(tmp_path, monkeypatch):
     wheels, out = tmp_path / "wheels", tmp_path / "out"
     wheels.mkdir()
     out.mkdir()
+    metadata = {"METADATA": "Metadata-Version: 2.1\nName: tiny-osf-toy\nVersion: 1.0\n", "RECORD": ""}
+    metadata["WHEEL"] = "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
     with zipfile.ZipFile(wheels / "tiny_osf_toy-1.0-py3-none-any.whl", "w") as wheel:
-        wheel.writestr(
-            "tiny_osf_toy-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: tiny-osf-toy\nVersion: 1.0\n"
-        )
-        wheel.writestr(
-            "tiny_osf_toy-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
-        )
-        wheel.writestr("tiny_osf_toy-1.0.dist-info/RECORD", "")
+        for name, content in metadata.items():
+            wheel.writestr(f"tiny_osf_toy-1.0.dist-info/{name}", content)
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(wheels))
     assert all(count >= 0 for count in pip_download("tiny-osf-toy==1.0", out))

@@ -16,6 +16,7 @@ from osfcore.objects.mesh import (
     resting_poses,
     textured_mesh,
 )
+from tests.core.objects.meshes import msh_bytes
 from tests.support.errors import about
 
 TEXTURE = np.full((8, 8, 3), 100, np.uint8)
@@ -45,11 +46,8 @@ def test_the_frame_is_the_centre_of_the_bounding_box_of_the_triangles_that_have_
 
 
 def test_normals_of_a_sphere_point_away_from_its_centre_across_seams():
-    ball = trimesh.creation.icosphere(3, 0.05)
-    split = trimesh.Trimesh(
-        ball.vertices[ball.faces].reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3), process=False
-    )
-    mesh = as_textured(split)
+    corners = trimesh.creation.icosphere(3, 0.05).triangles.reshape(-1, 3)
+    mesh = as_textured(trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False))
     cosine = np.einsum("ij,ij->i", mesh.normals, mesh.vertices) / 0.05
     assert cosine.min() > 0.999
 
@@ -84,20 +82,13 @@ def test_absurd_sizes_are_refused(size):
     assert caught.value.longest_m == pytest.approx(size)
 
 
-@pytest.mark.parametrize("fault", ["no triangles", "faces of no vertices", "flat", "not finite"])
-def test_unusable_geometry_is_refused(fault):
+def test_unusable_geometry_is_refused():
     ball = trimesh.creation.icosphere(1, 0.05)
-    vertices, faces = np.array(ball.vertices), ball.faces
-    if fault == "no triangles":
-        faces = faces[:0]
-    elif fault == "faces of no vertices":
-        faces = faces + 1000
-    elif fault == "flat":
-        vertices[:, 2] = 0
-    else:
-        vertices[3] = np.nan
-    with pytest.raises(CorruptFile):
-        textured_mesh(vertices, faces, np.zeros((len(vertices), 2)), TEXTURE, "mesh")
+    flat, endless = ball.vertices * [1, 1, 0], np.where(ball.vertices > 0.04, np.nan, ball.vertices)
+    wrong_faces = ((ball.vertices, faces) for faces in (ball.faces[:0], ball.faces + 1000))
+    for vertices, faces in (*wrong_faces, (flat, ball.faces), (endless, ball.faces)):
+        with pytest.raises(CorruptFile):
+            textured_mesh(vertices, faces, np.zeros((len(vertices), 2)), TEXTURE, "mesh")
 
 
 @pytest.mark.parametrize(
@@ -237,26 +228,19 @@ def test_a_chart_thinner_than_its_rim_keeps_a_colour():
     assert clean[31:33].max() == 200
 
 
-VERTICES = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], np.float32)
-UV = np.array([[0, 0], [1, 0], [0, 1], [0.25, 0.75]], np.float32)
-FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
-
-
-def msh_bytes(vertices=VERTICES, normals=None, uv=UV, faces=FACES) -> bytes:
-    normals = np.zeros((0, 3), np.float32) if normals is None else normals
-    counts = np.array([len(vertices), len(normals), len(uv), len(faces)], np.int32)
-    return b"".join(a.tobytes() for a in (counts, vertices, normals, uv, faces))
-
-
-@pytest.mark.parametrize("normals", [None, np.ones((4, 3), np.float32)])
-def test_msh_files_are_read_with_v_upwards_and_refused_if_truncated_or_without_uv(tmp_path, normals):
-    path = tmp_path / "a.msh"
-    path.write_bytes(msh_bytes(normals=normals))
+@pytest.mark.parametrize("normals", [(), np.ones((8, 3))])
+def test_msh_files_are_read_with_v_upwards_and_refused_if_truncated_or_without_uv_or_texture(tmp_path, normals):
+    path, uv, solid = tmp_path / "a.msh", np.random.default_rng(0).random((8, 2)), box()
+    whole = msh_bytes(solid.vertices, uv, solid.faces, normals)
+    path.write_bytes(whole)
+    with pytest.raises(CorruptFile, check=about("a.png")):
+        read_msh(path)
+    Image.fromarray(TEXTURE).save(tmp_path / "a.png")
     mesh = read_msh(path)
-    np.testing.assert_array_equal(mesh.vertices, VERTICES)
-    np.testing.assert_array_equal(mesh.faces, FACES)
-    np.testing.assert_array_equal(mesh.uv, np.stack([UV[:, 0], 1 - UV[:, 1]], axis=1))
-    for damaged in (b"", bytes(200), msh_bytes()[:-1], msh_bytes()[:-40], msh_bytes(uv=UV[:0])):
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), solid.extents, atol=1e-7)
+    corner = np.linalg.norm(mesh.vertices[:, None] - solid.vertices, axis=2).argmin(axis=1)
+    np.testing.assert_allclose(mesh.uv, np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)[corner], atol=1e-6)
+    for damaged in (b"", bytes(200), whole[:-1], whole[:-40], msh_bytes(solid.vertices, uv[:0], solid.faces, normals)):
         path.write_bytes(damaged)
         with pytest.raises(CorruptFile):
             read_msh(path)
