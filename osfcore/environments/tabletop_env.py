@@ -68,6 +68,9 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         image_side: of observed images [px].
         render_mode: "rgb_array" or None.
 
+    Attributes:
+        objects_to_choose_from: names of the objects by their numbers in observations.
+
     Raises:
         InvalidInput: if a choice is not among those, or there are too few objects.
         MissingAssets, UnknownName: if an object is not there.
@@ -92,24 +95,19 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
             raise InvalidInput("render_mode", repr(render_mode), '"rgb_array" or left out')
         self._library = AssetLibrary((default_data_dir() if data_dir is None else Path(data_dir)) / "objects")
         check_request(self._library, SceneRequest(count=objects, among=names))
-        self._available = self._library.names() if names is None else tuple(names)
+        self.objects_to_choose_from = self._library.names() if names is None else tuple(names)
         self._family: Family = family
         self._kind: Kind = obs
         self._count, self.render_mode = objects, render_mode
         check_tasks(self._tasks(0))
         self._cameras = default_cameras(image_side)
         self._goal_camera = goal_camera(image_side)
-        self._symmetries = {name: self._library.info(name).symmetry for name in self._available}
+        self._symmetries = {name: self._library.info(name).symmetry for name in self.objects_to_choose_from}
         self.action_space = gymnasium.spaces.Box(-_SPEED, _SPEED, (2,), np.float32)
         self.observation_space = self._space(image_side)
         self._world = Tabletop(self._library, cameras=self._cameras)
         self._task: RearrangementTask | None = None
         self._goal_image: UInt8[np.ndarray, "h w 3"] | None = None
-
-    @property
-    def objects_to_choose_from(self) -> tuple[str, ...]:
-        """Names of the objects by their numbers in observations."""
-        return self._available
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -157,7 +155,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._world.close()
 
     def _tasks(self, seed: int) -> TaskSet:
-        return TaskSet(self._available, self._family, self._count, seed)
+        return TaskSet(self.objects_to_choose_from, self._family, self._count, seed)
 
     def _drawn(self) -> RearrangementTask:
         """Draw a random task."""
@@ -194,7 +192,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         seen: dict[str, Any] = {"pusher": state.pusher[:2].clip(-PUSHER_REACH_M, PUSHER_REACH_M)}
         aim: dict[str, Any] = {}
         if self._kind != "pixels":
-            seen["objects"] = np.array([self._available.index(name) for name in state.names])
+            seen["objects"] = np.array([self.objects_to_choose_from.index(name) for name in state.names])
             seen["poses"], aim["poses"] = pose_rows(state.poses), pose_rows(goal.poses)
         if self._goal_image is not None:
             seen["pixels"], aim["pixels"] = self._seen(self._cameras), self._goal_image.copy()
@@ -206,7 +204,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         spaces: dict[str, gymnasium.Space[Any]] = {"pusher": box(-PUSHER_REACH_M, PUSHER_REACH_M, (2,), np.float64)}
         goal: dict[str, gymnasium.Space[Any]] = {}
         if self._kind != "pixels":
-            spaces["objects"] = gymnasium.spaces.MultiDiscrete([len(self._available)] * self._count)
+            spaces["objects"] = gymnasium.spaces.MultiDiscrete([len(self.objects_to_choose_from)] * self._count)
             limits = np.tile([TABLE_SIDE_M] * 3 + [1.0] * 4, (self._count, 1))
             spaces["poses"] = goal["poses"] = box(-limits, limits, dtype=np.float64)
         if self._kind != "poses":

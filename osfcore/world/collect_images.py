@@ -6,13 +6,12 @@ import json
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import CannotWrite, InvalidInput, check_ranges, check_seed
+from osfcore.errors import InvalidInput, check_ranges, check_seed
 from osfcore.geometry.cameras import (
     DEFAULT_IMAGE_SIDE,
     FIELD_OF_VIEW_DEG,
@@ -25,7 +24,7 @@ from osfcore.geometry.cameras import (
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import MAX_OBJECTS, Observation, SceneState
-from osfcore.io.files import folder_at_once, write_json
+from osfcore.io.files import folder_at_once, new_folder, write_json, writing
 from osfcore.io.image_file import to_uint8
 from osfcore.io.observation_file import write_observation
 from osfcore.io.scene_file import Scene, scene_to_json
@@ -48,7 +47,6 @@ MIN_IMAGES = 60
 MAX_IMAGES = 5000
 _SAMPLES = 4
 TRUTH_FILE = "truth.json"
-Split = Literal["train", "test"]
 # Makes an image from a random generator, its number in the split and the size of the split. Returns the camera, the
 # light's position, and RGBA (h, w, 4).
 Shoot = Callable[[np.random.Generator, int, int], tuple[Camera, np.ndarray, np.ndarray]]
@@ -144,33 +142,21 @@ def _write_set(config: CollectObject | CollectTable, shoot: Shoot, what: str) ->
     check_ranges(("number of images", images, MIN_IMAGES, MAX_IMAGES))
     if config.seed < 0:
         raise InvalidInput("seed", config.seed, "0 or more")
-    out = _check_folder(config.out)
+    out = new_folder(config.out)
     test = max(TEST_IMAGES, images // 8)
-    counts: dict[Split, int] = {"train": images - test, "test": test}
     done = 0
-    try:
-        with folder_at_once(out) as partial:
-            for part, (split, count) in enumerate(counts.items()):
-                rng = stream_rng(config.seed, Stream.COLLECTED_IMAGES, part)
-                folder = partial / split
-                folder.mkdir(parents=True)
-                annotations = []
-                for number in range(count):
-                    camera, light, rgba = shoot(rng, number, count)
-                    annotations.append(_save(folder / f"{number:04d}.png", camera, light, rgba))
-                    done += 1
-                    yield Progress(done, images, f"Image {done} of {images} of {what}")
-                (folder / "anno.json").write_text(json.dumps(annotations))
-    except OSError as error:
-        raise CannotWrite(out, error.strerror or str(error)) from error
-
-
-def _check_folder(out: Path) -> Path:
-    """Return the absolute path of an output folder that is new or empty; refuse any other."""
-    out = out.absolute()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InvalidInput("output folder", out, "new or empty")
-    return out
+    with writing(out), folder_at_once(out) as partial:
+        for part, (split, count) in enumerate((("train", images - test), ("test", test))):
+            rng = stream_rng(config.seed, Stream.COLLECTED_IMAGES, part)
+            folder = partial / split
+            folder.mkdir(parents=True)
+            annotations = []
+            for number in range(count):
+                camera, light, rgba = shoot(rng, number, count)
+                annotations.append(_save(folder / f"{number:04d}.png", camera, light, rgba))
+                done += 1
+                yield Progress(done, images, f"Image {done} of {images} of {what}")
+            (folder / "anno.json").write_text(json.dumps(annotations))
 
 
 def _save(path: Path, camera: Camera, light: np.ndarray, rgba: Float[np.ndarray, "h w 4"]) -> dict[str, object]:
@@ -247,7 +233,7 @@ def collect_observation(
     """
     image_side(config.size)
     check_seed(config.seed)
-    out = _check_folder(config.out)
+    out = new_folder(config.out)
     cameras = (goal_camera(config.size),) if config.goal else default_cameras(config.size)
     world = Tabletop(library, cameras=cameras, request=SceneRequest(_names(config, library, known), config.objects))
     try:
@@ -266,11 +252,9 @@ def collect_observation(
 
 def _names(config: CollectObservation, library: AssetLibrary, known: Collection[str] | None) -> tuple[str, ...] | None:
     """Choose the objects; None leaves the choice, or the error that there are none, to the world."""
-    if config.names is not None or known is None:
+    choice = [name for name in library.names() if name in (known or ())]
+    if config.names is not None or not choice:
         return config.names
-    choice = [name for name in library.names() if name in known]
-    if not choice:
-        return None
     check_ranges(("number of objects", config.objects, 1, min(len(choice), MAX_OBJECTS)))
     rng = stream_rng(config.seed, Stream.COLLECTED_NAMES)
     return tuple(choice[i] for i in rng.choice(len(choice), config.objects, replace=False))

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from osfcore.dynamics.motion import SLEEP_M, SLEEP_RAD, SUBSTEPS, is_on_table, pusher_path, substates
-from osfcore.errors import CannotWrite, InvalidInput, WorkerDied, check_ranges
+from osfcore.errors import InvalidInput, WorkerDied, check_ranges
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera, image_side
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import (
@@ -29,6 +29,7 @@ from osfcore.geometry.poses import (
 )
 from osfcore.geometry.states import MAX_OBJECTS, SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, STEP_S, WORKSPACE_HALF_M
+from osfcore.io.files import writing
 from osfcore.io.image_file import to_uint8
 from osfcore.io.push_file import Disturbed, EpisodeFolder, PushEpisode, load_episode, save_episode
 from osfcore.objects.asset import ObjectAsset
@@ -87,7 +88,7 @@ class _Track:
     """
 
     def __init__(self, episode: PushEpisode, models: Mapping[str, BodyModel]) -> None:
-        self._episode = episode
+        self._names, self._actions = episode.names, episode.actions
         poses = substates(episode)
         self._positions, self._quaternions = poses.position, poses.quaternion
         self._offset = np.array([models[name].T_object_inertial.position for name in episode.names])
@@ -100,7 +101,7 @@ class _Track:
         self._awake = is_shifting | (np.linalg.norm(self._angular, axis=-1) > SLEEP_RAD)
         on_table = is_on_table(episode)
         is_safe = np.repeat(on_table[:-1] & on_table[1:], SUBSTEPS)
-        moves: Bool[np.ndarray, "S"] = np.any(self._awake, axis=1)
+        moves = np.any(self._awake, axis=1)
         self.busy: Int[np.ndarray, "S"] = 1 + np.flatnonzero(moves[1:] & moves[:-1] & is_safe[1:])
 
     def disturb(self, physics: Physics, step: int, rng: np.random.Generator) -> tuple[object, ...]:
@@ -121,23 +122,16 @@ class _Track:
         turn = np.pad(_OFF_RAD * off * rng.normal(size=(len(awake), 1)), ((0, 0), (2, 0)))
         position = self._positions[step] + shift
         quaternion = quaternion_multiply(quaternion_exp(turn), self._quaternions[step])
-        after = self._play(physics, step, Pose(position, quaternion), linear, angular)
-        arm = -rotate(quaternion, self._offset)  # from the centre of mass to the object's origin
-        origin = linear + np.cross(angular, arm)
-        return step, position, quaternion, origin, angular, after.position, after.quaternion
-
-    def _play(
-        self, physics: Physics, step: int, start: Pose, linear: Float[np.ndarray, "N 3"], angular: np.ndarray
-    ) -> Pose:
-        """Return all poses one substep after a start with given velocities [m and rad in a substep]."""
-        names = self._episode.names
-        for i, name in enumerate(names):
-            physics.place(name, Pose(start.position[i], start.quaternion[i]))
+        for i, name in enumerate(self._names):
+            physics.place(name, Pose(position[i], quaternion[i]))
             physics.set_velocity(name, linear[i] / _SUBSTEP_S, angular[i] / _SUBSTEP_S)
         physics.place_pusher(np.array([*self._path[step], PUSHER_CENTRE_Z_M]))
         for _ in range(_TICKS):
-            physics.step(self._episode.actions[step // SUBSTEPS])
-        return Pose.stacked(physics.pose(name) for name in names)
+            physics.step(self._actions[step // SUBSTEPS])
+        after = Pose.stacked(physics.pose(name) for name in self._names)
+        arm = -rotate(quaternion, self._offset)  # from the centre of mass to the object's origin
+        origin = linear + np.cross(angular, arm)
+        return step, position, quaternion, origin, angular, after.position, after.quaternion
 
 
 def _noise(
@@ -346,7 +340,7 @@ def collect_pushes(
         decisive += ("camera", "size", "random_lights")
     settings = {name: getattr(config, name) for name in decisive}
     settings["available"] = list(library.names() if config.names is None else config.names)
-    try:
+    with writing(config.out):
         config.out.parent.mkdir(parents=True, exist_ok=True)
         with EpisodeFolder(config.out, settings) as folder:
             tally, done = _Tally(config), folder.finished()
@@ -359,10 +353,6 @@ def collect_pushes(
                 tally.add(episode, is_new=True)
                 yield tally.step()
             folder.combine(config.episodes)
-    except BrokenProcessPool as error:
-        raise WorkerDied("collecting pushes") from error
-    except OSError as error:
-        raise CannotWrite(config.out, error.strerror or str(error)) from error
 
 
 def _check(config: CollectPushes) -> None:
@@ -426,6 +416,8 @@ def _simulate(
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in finished:
                 yield running.pop(future), future.result()
+    except BrokenProcessPool as error:
+        raise WorkerDied("collecting pushes") from error
     finally:
         for future in running:
             future.cancel()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from itertools import pairwise
 
 import cv2
@@ -284,23 +284,18 @@ def pusher_mesh() -> TexturedMesh:
     rings = [np.column_stack([PUSHER_RADIUS_M * circle, np.full(_SIDES, z)]) for z in (-half, half)]
     wall = np.column_stack([circle, np.zeros(_SIDES)])
     down, up = np.tile([0.0, 0, -1], (_SIDES, 1)), np.tile([0.0, 0, 1], (_SIDES, 1))
-    vertices = np.concatenate([rings[0], rings[1], rings[0], rings[1]])
-    normals = np.concatenate([wall, wall, down, up])
-    i = np.arange(_SIDES)
+    vertices = np.concatenate([*rings, *rings]).astype(np.float32)
+    normals = np.concatenate([wall, wall, down, up]).astype(np.float32)
+    i, k = np.arange(_SIDES), np.arange(1, _SIDES - 1)
     j = (i + 1) % _SIDES
-    faces = [np.stack([i, j, j + _SIDES], axis=1), np.stack([i, j + _SIDES, i + _SIDES], axis=1)]
-    k = np.arange(1, _SIDES - 1)
-    bottom, top = 2 * _SIDES, 3 * _SIDES
-    faces.append(np.stack([np.full_like(k, bottom), bottom + k + 1, bottom + k], axis=1))
-    faces.append(np.stack([np.full_like(k, top), top + k, top + k + 1], axis=1))
-    texture = np.round(np.array(PUSHER_ALBEDO) * 255).astype(np.uint8).reshape(1, 1, 3)
-    return TexturedMesh(
-        vertices.astype(np.float32),
-        normals.astype(np.float32),
-        np.concatenate(faces).astype(np.int32),
-        np.full((len(vertices), 2), 0.5, np.float32),
-        texture,
+    bottom, top = np.full_like(k, 2 * _SIDES), np.full_like(k, 3 * _SIDES)
+    corners = (
+        *((i, j, j + _SIDES), (i, j + _SIDES, i + _SIDES)),  # of the wall
+        *((bottom, bottom + k + 1, bottom + k), (top, top + k, top + k + 1)),
     )
+    faces = np.concatenate([np.stack(each, axis=1) for each in corners]).astype(np.int32)
+    texture = np.round(np.array(PUSHER_ALBEDO) * 255).astype(np.uint8).reshape(1, 1, 3)
+    return TexturedMesh(vertices, normals, faces, np.full((len(vertices), 2), 0.5, np.float32), texture)
 
 
 # One view to trace: its bodies, camera and light; its rays and shadows.
@@ -414,10 +409,7 @@ class Shot:
         """
         lit = np.ones(len(points), np.float32)
         for i, body in enumerate(self.bodies):
-            if i == receiver:
-                candidates = np.nonzero(lit)[0]
-            else:
-                candidates = np.nonzero((lit > 0) & self._may_shade(body, points))[0]
+            candidates = np.nonzero(lit if i == receiver else (lit > 0) & self._may_shade(body, points))[0]
             if len(candidates):
                 rays, end = self._to_light(points[candidates])
                 blocked = body.mesh.occludes(*into_frame(body.pose, points[candidates], rays), end)
@@ -598,32 +590,25 @@ class Picture:
     depth: Float[np.ndarray, "h w"]
 
 
+@dataclass(frozen=True, eq=False)
 class RayTracer:
     """Traces views of scenes made of known meshes.
 
-    Args:
+    Attributes:
         meshes: the objects that scenes may name.
-        lamp: strengths of ambient and diffuse light, and their colour; the usual ones if None.
-        table: the look of the table; the usual one if None.
+        lamp: strengths of ambient and diffuse light, and their colour.
+        table: the look of the table.
         spot: a near lamp in the place of the light of every state.
         executor: traces the views of one call side by side, if given (threads serve: Embree releases the GIL).
     """
 
-    def __init__(
-        self,
-        meshes: Mapping[str, TracedMesh],
-        *,
-        lamp: Lamp | None = None,
-        table: TableSurface | None = None,
-        spot: SpotLamp | None = None,
-        executor: Executor | None = None,
-    ) -> None:
-        self._meshes = dict(meshes)
-        self._pusher = TracedMesh(pusher_mesh())
-        self._lamp = lamp or Lamp()
-        self._table = table or TableSurface()
-        self._spot = spot
-        self._executor = executor
+    meshes: Mapping[str, TracedMesh]
+    _: KW_ONLY
+    lamp: Lamp = Lamp()
+    table: TableSurface = TableSurface()
+    spot: SpotLamp | None = None
+    executor: Executor | None = None
+    _pusher: TracedMesh = field(init=False, repr=False, default_factory=lambda: TracedMesh(pusher_mesh()))
 
     def render(
         self, state: SceneState, cameras: tuple[Camera, ...], *, samples: int | None = None, sharp: bool = False
@@ -639,13 +624,15 @@ class RayTracer:
         Raises:
             KeyError: if the state names an object without mesh.
         """
-        bodies = [Body(self._meshes[name], state.poses[i]) for i, name in enumerate(state.names)]
+        bodies = [Body(self.meshes[name], state.poses[i]) for i, name in enumerate(state.names)]
         if state.pusher is not None:
             bodies.append(Body(self._pusher, Pose(state.pusher, Pose.identity().quaternion)))
         light = state.light.direction.astype(np.float32)
-        lamp, table, spot = self._lamp, self._table, self._spot
-        shots = [Shot(tuple(bodies), light, c, lamp, table, samples or _samples_for(c), sharp, spot) for c in cameras]
-        return tuple(map(_trace, shots) if self._executor is None else self._executor.map(_trace, shots))
+        shots = [
+            Shot(tuple(bodies), light, camera, self.lamp, self.table, samples or _samples_for(camera), sharp, self.spot)
+            for camera in cameras
+        ]
+        return tuple(map(_trace, shots) if self.executor is None else self.executor.map(_trace, shots))
 
     def render_alone(
         self, name: str, light_direction: Float[np.ndarray, "3"], camera: Camera, *, samples: int = DEFAULT_SAMPLES
@@ -658,9 +645,9 @@ class RayTracer:
             camera: a view, in the object's frame.
             samples: samples along each side of a pixel.
         """
-        bodies = (Body(self._meshes[name], Pose.identity()),)
+        bodies = (Body(self.meshes[name], Pose.identity()),)
         light = np.asarray(light_direction, np.float32)
-        return _trace(Shot(bodies, light, camera, self._lamp, None, samples, False))
+        return _trace(Shot(bodies, light, camera, self.lamp, None, samples, False))
 
 
 def _samples_for(camera: Camera) -> int:

@@ -114,7 +114,6 @@ class Physics:
         self, models: Mapping[str, BodyModel], *, friction_factor: float = 1.0, mass_factor: float = 1.0
     ) -> None:
         self._bullet = BulletClient()
-        self._is_open = True
         self._models = dict(models)
         self._friction = friction_factor * OBJECT_FRICTION
         self._mass_factor = mass_factor
@@ -132,9 +131,8 @@ class Physics:
         table = bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
         self._table = bullet.createMultiBody(0, table, basePosition=[0, 0, -_TABLE_THICKNESS_M / 2])
         self._set_contacts(self._table, TABLE_FRICTION)
-        floor_shape = bullet.createCollisionShape(pybullet.GEOM_PLANE)
-        floor = bullet.createMultiBody(0, floor_shape, basePosition=[0, 0, FLOOR_Z_M])
-        self._set_contacts(floor, TABLE_FRICTION)
+        plane = bullet.createCollisionShape(pybullet.GEOM_PLANE)
+        self._set_contacts(bullet.createMultiBody(0, plane, basePosition=[0, 0, FLOOR_Z_M]), TABLE_FRICTION)
         self._pusher_position = np.array([0, 0, 2.0])
         cylinder = bullet.createCollisionShape(pybullet.GEOM_CYLINDER, radius=PUSHER_RADIUS_M, height=PUSHER_HEIGHT_M)
         self._pusher = bullet.createMultiBody(PUSHER_MASS_KG, cylinder, basePosition=[0, 0, 2.0])
@@ -145,16 +143,10 @@ class Physics:
             self._uids[name] = self._add(model)
 
     def _set_contacts(self, uid: int, friction: float) -> None:
-        self._bullet.changeDynamics(
-            uid,
-            -1,
-            lateralFriction=friction,
-            rollingFriction=ROLLING_FRICTION_M,
-            spinningFriction=SPINNING_FRICTION_M,
-            linearDamping=0,
-            angularDamping=0,
-            collisionMargin=COLLISION_MARGIN_M,
-        )
+        turning = {"rollingFriction": ROLLING_FRICTION_M, "spinningFriction": SPINNING_FRICTION_M}
+        damping = {"linearDamping": 0, "angularDamping": 0}
+        margin = COLLISION_MARGIN_M
+        self._bullet.changeDynamics(uid, -1, lateralFriction=friction, collisionMargin=margin, **turning, **damping)
 
     def _add(self, model: BodyModel) -> int:
         """Add one object, out of everything's way until it is placed; return its Bullet id."""
@@ -172,9 +164,7 @@ class Physics:
 
     def close(self) -> None:
         """Free the simulation."""
-        if self._is_open:
-            self._bullet.disconnect()
-            self._is_open = False
+        self._bullet.disconnect()
 
     @property
     def pusher(self) -> Float[np.ndarray, "3"]:

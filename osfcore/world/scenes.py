@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, MissingAssets, NoRoom, OsfError, OverlappingObjects, check_ranges
+from osfcore.errors import InvalidInput, MissingAssets, NoRoom, OsfError, OverlappingObjects, check_ranges, check_unique
 from osfcore.geometry.light import Light, SpotLamp
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
-from osfcore.geometry.states import MAX_OBJECTS, SceneState
+from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M, TABLE_SIDE_M, WORKSPACE_HALF_M
 from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
@@ -58,7 +58,7 @@ def check_request(library: AssetLibrary, request: SceneRequest) -> None:
     """
     if request.names is not None:
         check_ranges(("number of objects", len(request.names), 1, MAX_OBJECTS))
-        _check_unrepeated(request.names)
+        check_unique("list of objects", request.names)
         for name in request.names:
             check_object(library, name)
         return
@@ -66,17 +66,12 @@ def check_request(library: AssetLibrary, request: SceneRequest) -> None:
     choice = library.names() if request.among is None else request.among
     for name in request.among or ():
         check_object(library, name)
-    _check_unrepeated(choice)
+    check_unique("list of objects", choice)
     if request.among is None and not choice:
         raise OsfError("There are no objects on this machine yet; get them with 'osf assets fetch'.")
     if request.count > len(choice):
         allowed = f"at most {len(choice)}, as many as there are to choose from"
         raise InvalidInput("number of objects", request.count, allowed)
-
-
-def _check_unrepeated(names: tuple[str, ...]) -> None:
-    if len(set(names)) != len(names):
-        raise InvalidInput("list of objects", ", ".join(names), "without repetition")
 
 
 def check_place(name: str, position: Float[np.ndarray, "3"]) -> None:
@@ -199,12 +194,6 @@ def _separate(physics: Physics, first: str, second: str, depth_m: float, normal:
         _shift(physics, first if normal[2] > 0 else second, np.array([0.0, 0.0, depth_m]))
     else:
         _shift(physics, first, depth_m * normal)
-
-
-def above_table(state: SceneState) -> SceneState:
-    """Return the state with objects whose centre is below the table lifted to it."""
-    positions = np.maximum(state.poses.position, [-np.inf, -np.inf, 0.0])
-    return replace(state, poses=Pose(positions, state.poses.quaternion))
 
 
 def _shift(physics: Physics, name: str, by: Float[np.ndarray, "3"]) -> None:

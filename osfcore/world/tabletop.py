@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from osfcore.control.world import SimulatedWorld
-from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName, finite_vector
+from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, check_known, finite_vector
 from osfcore.geometry.cameras import Camera, default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -29,7 +29,6 @@ from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, BodyModel, Physics, bod
 from osfcore.world.scenes import (
     Conditions,
     SceneRequest,
-    above_table,
     check_object,
     check_place,
     check_request,
@@ -118,12 +117,10 @@ class Tabletop:
 
     def close(self) -> None:
         """Free the simulation."""
-        if self._physics is not None:
-            self._physics.close()
-            self._physics = None
-        if self._tiny is not None:
-            self._tiny.close()
-            self._tiny = None
+        for simulation in (self._physics, self._tiny):
+            if simulation is not None:
+                simulation.close()
+        self._physics = self._tiny = None
 
     # What only a simulator can do
 
@@ -184,7 +181,7 @@ class Tabletop:
         for name in state.names:
             check_object(self._library, name)
             check_place(name, state.pose(name).position)
-        before = None if self._physics is None else self.truth()
+        before = self.truth() if self._physics else None
         self._place_all(state)
         try:
             refuse_overlaps(self._bodies, self.names)
@@ -202,7 +199,8 @@ class Tabletop:
         Raises:
             UnknownName, MissingAssets, InvalidInput: as `load`.
         """
-        state = above_table(state)
+        positions = np.maximum(state.poses.position, [-np.inf, -np.inf, 0.0])  # no centre below the table
+        state = replace(state, poses=Pose(positions, state.poses.quaternion))
         for name in state.names:
             check_place(name, state.pose(name).position)
         self.restore(state)
@@ -271,8 +269,7 @@ class Tabletop:
             InvalidInput: if the pose is not finite, its quaternion not unit, or it is not over the table.
             OverlappingObjects: if it would penetrate something by more than 2 mm; then nothing moved.
         """
-        if name not in self.names:
-            raise UnknownName("object on the table", name, self.names)
+        check_known("object on the table", [name], self.names)
         position = finite_vector(pose.position, 3, f"position of {name} [m]")
         check_place(name, position)
         quaternion = unit_quaternion(pose.quaternion, f"quaternion of {name}")

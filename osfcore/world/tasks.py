@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects, UnknownName, check_ranges
+from osfcore.errors import InvalidInput, NoRoom, OverlappingObjects, check_known, check_ranges
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
 from osfcore.geometry.states import SceneState
@@ -183,9 +183,7 @@ def arranged_goal(world: Tabletop, poses: Mapping[str, Pose], *, is_measured: bo
         OverlappingObjects: if objects would overlap, unless poses are measured.
     """
     state = world.truth()
-    for name in poses:
-        if name not in state.names:
-            raise UnknownName("object on the table", name, state.names)
+    check_known("object on the table", poses, state.names)
     stacked = Pose.stacked(poses.get(name, state.pose(name)) for name in state.names)
     (world.load_measured if is_measured else world.load)(replace(state, poses=stacked, pusher=None))
     for _ in world.settle():

@@ -50,12 +50,12 @@ class TinyScene:
         """Draw a state; coverage is 0 or 1, for TinyRenderer does not smooth edges."""
         for i, name in enumerate(state.names):
             self._place(self._bodies[name], state.poses[i])
-        hidden = np.array([0.0, 0.0, -100.0])
-        place = hidden if state.pusher is None else state.pusher
-        self._place(self._pusher, Pose(place, Pose.identity().quaternion))
         uids = [self._bodies[name] for name in state.names]
+        place = np.array([0.0, 0.0, -100.0])  # out of sight
         if state.pusher is not None:
+            place = state.pusher
             uids.append(self._pusher)
+        self._place(self._pusher, Pose(place, Pose.identity().quaternion))
         return tuple(self._picture(state, camera, uids) for camera in cameras)
 
     def _picture(self, state: SceneState, camera: Camera, uids: list[int]) -> Picture:
@@ -63,7 +63,7 @@ class TinyScene:
         _, _, rgba, depth, segments = self._bullet.getCameraImage(
             camera.width,
             camera.height,
-            _view_matrix(camera),
+            (np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.T_world_camera.inverse().matrix()).T.ravel().tolist(),
             _projection_matrix(camera),
             lightDirection=(state.light.direction * _LIGHT_DISTANCE_M).tolist(),
             lightColor=[1, 1, 1],
@@ -104,12 +104,6 @@ def _as_obj(mesh: TexturedMesh) -> str:
     lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in mesh.normals.tolist()]
     lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
     return "\n".join(lines) + "\n"
-
-
-def _view_matrix(camera: Camera) -> list[float]:
-    """OpenGL view matrix (x right, y up, z backward), column-major."""
-    world_to_camera = camera.T_world_camera.inverse().matrix()
-    return (np.diag([1.0, -1.0, -1.0, 1.0]) @ world_to_camera).T.ravel().tolist()
 
 
 def _projection_matrix(camera: Camera) -> list[float]:

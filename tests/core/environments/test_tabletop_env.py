@@ -24,20 +24,13 @@ NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 STAND = np.zeros(2, np.float32)
 
 
-@pytest.fixture(scope="module")
-def folder(library, tmp_path_factory):
-    place = tmp_path_factory.mktemp("env")
-    (place / "objects").symlink_to(library.root)
-    return place
-
-
 @pytest.fixture
-def made(folder):
+def made(data_dir):
     """Makes environments of small scenes, and closes them."""
     envs = []
 
     def make(**chosen):
-        envs.append(gymnasium.make(TABLETOP_ID, **{"data_dir": folder, "names": NAMES, "objects": 2, **chosen}))
+        envs.append(gymnasium.make(TABLETOP_ID, **{"data_dir": data_dir, "names": NAMES, "objects": 2, **chosen}))
         return envs[-1]
 
     yield make
@@ -127,8 +120,8 @@ def test_a_task_of_an_evaluation_can_be_asked_for(made, library):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_environments_side_by_side_are_those_one_by_one(folder, made, mode):
-    chosen = {"data_dir": folder, "names": NAMES, "objects": 2, "obs": "both", "image_side": 32}
+def test_environments_side_by_side_are_those_one_by_one(data_dir, made, mode):
+    chosen = {"data_dir": data_dir, "names": NAMES, "objects": 2, "obs": "both", "image_side": 32}
     envs = gymnasium.make_vec(f"osfcore.environments:{TABLETOP_ID}", num_envs=2, vectorization_mode=mode, **chosen)
     try:
         seen, _ = envs.reset(seed=7)
@@ -144,33 +137,22 @@ def test_environments_side_by_side_are_those_one_by_one(folder, made, mode):
 
 
 @pytest.mark.slow
-def test_the_program_of_the_docs_runs(folder, tmp_path):
+def test_the_program_of_the_docs_runs(data_dir, tmp_path):
     guide = (Path(__file__).parents[3] / "docs" / "extending.md").read_text()
     (program,) = re.findall(r"```python\n(.*?)```", guide, flags=re.DOTALL)
-    environment = {**os.environ, "OSF_DATA_DIR": str(folder)}
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
+    environment = {**os.environ, "OSF_DATA_DIR": str(data_dir)}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-500:]
     assert "shall lie as in (2, 7) (64, 64, 3)" in done.stdout
     assert "side by side (2, 1, 7)" in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("chosen", "error"),
-    [
-        ({"obs": "depth"}, InvalidInput),
-        ({"family": "flying"}, InvalidInput),
-        ({"objects": 3}, InvalidInput),
-        ({"names": ("001_chips_can",), "objects": 1}, UnknownName),
-        ({"image_side": 8}, InvalidInput),
-        ({"render_mode": "ansi"}, InvalidInput),
-        ({"data_dir": "nowhere", "names": None}, OsfError),
-    ],
-)
-def test_mistakes_are_refused(made, chosen, error):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Gymnasium's own, of an unknown render mode
+@pytest.mark.filterwarnings("ignore")  # Gymnasium's own, of an unknown render mode
+def test_mistakes_are_refused(made):
+    mistakes = ({"obs": "depth"}, {"family": "flying"}, {"objects": 3}, {"image_side": 8}, {"render_mode": "ansi"})
+    others = ((UnknownName, {"names": ("no_can",), "objects": 1}), (OsfError, {"data_dir": "nowhere", "names": None}))
+    for error, chosen in (*((InvalidInput, mistake) for mistake in mistakes), *others):
         with pytest.raises(error):
             made(**chosen)
 

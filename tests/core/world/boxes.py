@@ -24,6 +24,13 @@ def box_asset(name: str, size: tuple[float, float, float], *, mass_kg: float = 0
     return ObjectAsset(info, mesh, (np.array(box.vertices),), resting)
 
 
+def slab_spans(half, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays enter and leave a box of these half sides around the origin [ray lengths], by the slab method."""
+    with np.errstate(divide="ignore"):
+        near, far = np.sort([(-half - origins) / directions, (half - origins) / directions], axis=0)
+    return near.max(axis=-1), far.min(axis=-1)
+
+
 def table_points(camera: Camera) -> np.ndarray:
     """Where the rays through pixel centres meet the table [m]."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5

@@ -1,4 +1,3 @@
-import contextlib
 import json
 import multiprocessing
 import os
@@ -33,8 +32,8 @@ from osfcore.world.collect_pushes import (
 )
 from osfcore.world.physics import body_model
 from osfcore.world.scenes import SceneRequest
-from osfcore.world.tabletop import Tabletop
 from tests.support.errors import about
+from tests.support.same import assert_same
 
 CAN, GELATIN, DRILL = "005_tomato_soup_can", "009_gelatin_box", "035_power_drill"
 
@@ -44,13 +43,6 @@ def collect(library, out, executor=None, **settings) -> tuple[PushEpisode, ...]:
     steps = list(collect_pushes(config, library, executor))
     assert steps[-1].done == steps[-1].total == config.episodes
     return read_pushes(out)
-
-
-def assert_same(a: tuple[PushEpisode, ...], b: tuple[PushEpisode, ...]) -> None:
-    for x, y in zip(a, b, strict=True):
-        assert (x.names, x.seed) == (y.names, y.seed)
-        for name in ("positions", "quaternions", "pusher", "actions", "contact"):
-            np.testing.assert_array_equal(getattr(x, name), getattr(y, name))
 
 
 def test_episodes_have_the_stated_shapes_and_tell_the_truth(library, tmp_path):
@@ -75,11 +67,10 @@ def test_episodes_have_the_stated_shapes_and_tell_the_truth(library, tmp_path):
 
 
 def test_disturbed_states_change_nothing_else(library, tmp_path):
-    plain = collect(library, tmp_path / "plain.h5", policy="directed", episodes=1, steps=8)
-    both = collect(library, tmp_path / "both.h5", policy="directed", episodes=1, steps=8, disturb=2)
-    assert_same(plain, both)
-    assert plain[0].disturbed is None
-    assert len(both[0].disturbed.step) > 0
+    given = {"policy": "directed", "episodes": 1, "steps": 8}
+    (plain,), (both,) = (collect(library, tmp_path / f"{n}.h5", disturb=n, **given) for n in (0, 2))
+    assert_same(replace(both, disturbed=None), plain)
+    assert len(both.disturbed.step) > 0
 
 
 @pytest.mark.slow
@@ -109,15 +100,13 @@ def test_abandoned_collection_goes_on_where_it_was_with_the_same_objects_alone(l
 
 
 @pytest.mark.slow
-def test_killed_collection_loses_and_repeats_nothing(library, tmp_path):
+def test_killed_collection_loses_and_repeats_nothing(library, data_dir, tmp_path):
     whole = collect(library, tmp_path / "whole.h5", episodes=8, steps=30)
     out = tmp_path / "killed.h5"
     command = [
         *(sys.executable, "-m", "app.cli", "collect", "pushes", "--out", str(out), "--episodes", "8", "--steps", "30"),
-        *("--workers", "1", "--data-dir", str(tmp_path / "data")),
+        *("--workers", "1", "--data-dir", str(data_dir)),
     ]
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "objects").symlink_to(library.root)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     partial = tmp_path / "killed.h5.partial"
     deadline = time.monotonic() + 60
@@ -130,20 +119,19 @@ def test_killed_collection_loses_and_repeats_nothing(library, tmp_path):
     assert_same(read_pushes(out), whole)
 
 
-def test_frames_are_those_of_the_chosen_camera_under_a_light_of_their_own(library, tmp_path):
+def test_frames_are_those_of_the_chosen_camera_under_a_light_of_their_own(library, tables, tmp_path):
     """The pushes are the same whatever is seen of them."""
     shared = {"episodes": 1, "steps": 2, "objects": 2}
     (plain,) = collect(library, tmp_path / "plain.h5", **shared)
-    assert plain.frames is None
     shared |= {"images": True, "size": 32, "camera": "goal"}
     (goal,), (lit,) = (collect(library, tmp_path / f"{on}.h5", random_lights=on, **shared) for on in (False, True))
-    assert_same((plain, plain), (goal, lit))
-    with contextlib.closing(Tabletop(library, request=SceneRequest(count=2))) as world:
-        world.arrange(goal.seed)
-        for frames in (goal.frames, lit.frames):
-            assert frames.shape == (3, 32, 32, 3)
-            np.testing.assert_array_equal(frames[0], to_uint8(world.render((goal_camera(32),)).images[0]))
-            world.set_light(Light.random(stream_rng(0, Stream.COLLECTED_LIGHT, 0), MIN_LIGHT_ELEVATION_DEG))
+    for seen in (goal, lit):
+        assert_same(replace(seen, frames=None), plain)
+    world = tables(goal.seed, request=SceneRequest(count=2))
+    for frames in (goal.frames, lit.frames):
+        assert frames.shape == (3, 32, 32, 3)
+        np.testing.assert_array_equal(frames[0], to_uint8(world.render((goal_camera(32),)).images[0]))
+        world.set_light(Light.random(stream_rng(0, Stream.COLLECTED_LIGHT, 0), MIN_LIGHT_ELEVATION_DEG))
 
 
 def test_only_the_named_objects_are_pushed(library, tmp_path):
@@ -196,8 +184,7 @@ def test_every_substep_in_which_something_moves_is_played_as_often_as_asked(push
     positions = substates(pushed[0]).position
     moved = np.linalg.norm(np.diff(positions, axis=0), axis=-1).max(axis=1)
     assert (moved[found.step] > SLEEP_M / 2).all()
-    assert found.step.min() >= 1
-    assert found.step.max() < len(positions) - 1
+    assert 1 <= found.step.min() < found.step.max() < len(positions) - 1
     assert np.array_equal(found.after_positions, again.after_positions)  # the seed decides
     assert not np.array_equal(found.linear, other.linear)
 
@@ -234,13 +221,9 @@ def test_undisturbed_the_simulator_repeats_what_was_recorded(pushed, monkeypatch
 def test_where_nothing_moves_there_is_nothing_to_disturb(pushed):
     episode, models = pushed
     still = {
-        name: np.broadcast_to(first, getattr(episode, name).shape)
-        for name, first in (
-            ("positions", episode.positions[0]),
-            ("quaternions", episode.quaternions[0]),
-            ("sub_positions", episode.positions[0]),
-            ("sub_quaternions", episode.quaternions[0]),
-        )
+        below + name: np.broadcast_to(getattr(episode, name)[0], getattr(episode, below + name).shape)
+        for name in ("positions", "quaternions")
+        for below in ("", "sub_")
     }
     found = run((replace(episode, **still), models), count=3)
     assert found.step.shape == (0,)
@@ -251,29 +234,26 @@ def test_where_nothing_moves_there_is_nothing_to_disturb(pushed):
 
 
 @pytest.mark.slow
-def test_directed_policy_has_sustained_contact_where_the_paper_policy_rarely_has(library):
-    shares = []
-    with contextlib.closing(Tabletop(library, request=SceneRequest(count=3))) as world:
-        for policy_of in (lambda rng: PaperPolicy(rng), lambda rng: DirectedPolicy(world.assets, rng)):
-            contacts = []
-            for seed in range(8):
-                world.arrange(seed)
-                policy = policy_of(np.random.default_rng(seed))
-                for _ in range(50):
-                    action = check_action(policy.action(world.truth()))
-                    contacts.append(bool(world.act_recorded(action, 1)[0]))
-            shares.append(np.mean(contacts))
+def test_directed_policy_has_sustained_contact_where_the_paper_policy_rarely_has(tables):
+    shares, world = [], tables()
+    for policy_of in (PaperPolicy, lambda rng: DirectedPolicy(world.assets, rng)):
+        contacts = []
+        for seed in range(8):
+            world.arrange(seed)
+            policy = policy_of(np.random.default_rng(seed))
+            for _ in range(50):
+                action = check_action(policy.action(world.truth()))
+                contacts.append(bool(world.act_recorded(action, 1)[0]))
+        shares.append(np.mean(contacts))
     assert shares[1] > 0.4
     assert shares[1] > 2 * shares[0]
 
 
-def test_paper_policy_is_uniform_in_the_speed_limits_and_the_directed_one_needs_a_pusher(library):
-    policy = PaperPolicy(np.random.default_rng(0))
-    with contextlib.closing(Tabletop(library)) as world:
-        world.arrange(0)
-        state = world.truth()
-        with pytest.raises(InvalidInput, check=about("pusher")):
-            DirectedPolicy(world.assets, np.random.default_rng(0)).action(replace(state, pusher=None))
+def test_paper_policy_is_uniform_in_the_speed_limits_and_the_directed_one_needs_a_pusher(tables):
+    world, policy = tables(0), PaperPolicy(np.random.default_rng(0))
+    state = world.truth()
+    with pytest.raises(InvalidInput, check=about("pusher")):
+        DirectedPolicy(world.assets, np.random.default_rng(0)).action(replace(state, pusher=None))
     actions = np.array([policy.action(state) for _ in range(4000)])
     np.testing.assert_array_equal(actions[:, 2], 0)
     assert np.abs(actions).max() <= MAX_SPEED_M_S

@@ -10,15 +10,14 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import Quality, SceneBatch
-from osfcore.world.imaging import TABLE_ALBEDO, Lamp, RayTracer, TableSurface, TracedMesh, masks_of, wooden_texture
-from tests.core.world.boxes import box_asset, table_points
+from osfcore.world.imaging import TABLE_ALBEDO, RayTracer, TracedMesh, masks_of
+from tests.core.world.boxes import box_asset, slab_spans, table_points
 from tests.support.rendered_scenes import block, table_of
 
 HALF = np.array([0.03, 0.02, 0.05])
 BOX = TracedMesh(box_asset("box", tuple(2 * HALF)).mesh)
 TURN = quaternion_exp(np.array([0, 0, 0.4]))
-SPOT = SpotLamp(np.array([0.2, 0.1, 0.35]), np.array([0.02, 0.0, 0.0]), 20, 35)
-BARE = SpotLamp(SPOT.position, np.zeros(3), 80, 90)
+BARE = SpotLamp(np.array([0.2, 0.1, 0.35]), np.zeros(3), 80, 90)
 ABOVE = Camera.look_at("above", (0, 0, 1.2), (0, 0, 0), size=256, fov_y_deg=30)
 
 
@@ -28,20 +27,12 @@ def boxes(*places, pusher=None, light=(0, 0, 1.0)) -> SceneState:
     return SceneState(tuple(f"box {i}" for i in range(len(places))), poses, Light(np.array(light)), pusher)
 
 
-def traced(state: SceneState, camera: Camera, spot: SpotLamp | None, **given):
-    return RayTracer(dict.fromkeys(state.names, BOX), spot=spot, **given).render(state, (camera,))[0]
+def traced(state: SceneState, camera: Camera, spot: SpotLamp | None):
+    return RayTracer(dict.fromkeys(state.names, BOX), spot=spot).render(state, (camera,))[0]
 
 
 def open_irradiance(points: np.ndarray, spot: SpotLamp) -> np.ndarray:
     return 0.25 + 0.75 * spot.toward(points)[..., 2] * spot.falloff(points) * spot.spot_factor(points)
-
-
-def shaded_by_box(points: np.ndarray, spot: SpotLamp, centre: np.ndarray) -> np.ndarray:
-    """Whether the way from points to the lamp passes through the box at `centre`, by the slab method in its frame."""
-    into = Pose(centre, TURN).inverse()
-    start, ways = into.apply(points), into.apply(spot.position) - into.apply(points)
-    enter, leave = np.sort([(-HALF - start) / ways, (HALF - start) / ways], axis=0)
-    return np.maximum(enter.max(axis=-1), 0) < np.minimum(leave.min(axis=-1), 1)
 
 
 @pytest.mark.parametrize("spot", [BARE, SpotLamp(np.array([0, 0, 0.3]), np.array([0.1, 0.0, 0]), 15, 15)])
@@ -60,7 +51,10 @@ def test_the_shadow_of_a_box_is_its_perspective_projection(lamp):
     spot, centre = SpotLamp(np.array(lamp), np.zeros(3), 80, 90), np.array([0.01, 0.0, 0.05])
     picture, points = traced(boxes(centre), ABOVE, spot), table_points(ABOVE)
     on_table = picture.coverage[0] == 0
-    dark = shaded_by_box(points, spot, centre)
+    into = Pose(centre, TURN).inverse()
+    start = into.apply(points)
+    enter, leave = slab_spans(HALF, start, into.apply(spot.position) - start)
+    dark = np.maximum(enter, 0) < np.minimum(leave, 1)  # the way to the lamp passes through the box
     bright = TABLE_ALBEDO[0] * open_irradiance(points, spot)
     shaded = picture.rgb[..., 0] < (bright + 0.25 * TABLE_ALBEDO[0]) / 2
     assert (dark & on_table).sum() > 200
@@ -86,16 +80,6 @@ def test_a_lamp_200_m_away_is_the_distant_light():
         assert np.mean(np.abs(near.rgb - distant.rgb).max(axis=-1) > 5e-3) < 2e-3  # samples on outlines of shadows
         np.testing.assert_allclose(near.rgb, distant.rgb, atol=0.05)
         np.testing.assert_array_equal(near.coverage, distant.coverage)
-
-
-def test_a_lamp_shines_on_wood_in_the_colour_of_its_strength():
-    wood, lamp = TableSurface(texture=wooden_texture(np.random.default_rng(0), 512)), Lamp(0.1, 0.8, 1.2, (1, 0.9, 0.8))
-    state = boxes((0.03, 0, 0.05))
-    tracer = RayTracer({"box 0": BOX}, spot=SPOT, lamp=lamp, table=wood)
-    (default,), (exact,) = (
-        tracer.render(state, (goal_camera(48),), **how) for how in ({}, dict(samples=8, sharp=True))
-    )
-    assert -10 * np.log10(np.mean((default.rgb - exact.rgb) ** 2)) > 36
 
 
 @pytest.mark.parametrize("lamp", [(0.3, 0.1, 0.45), (-0.2, 0.25, 0.3)])

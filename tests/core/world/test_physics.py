@@ -23,7 +23,6 @@ def simulated():
     yield make
     for physics in made:
         physics.close()
-        physics.close()  # again does nothing
 
 
 def test_mass_properties_of_a_turned_box_are_the_closed_form_and_parts_add_up():
@@ -84,7 +83,7 @@ def test_a_box_heavier_than_the_pusher_yields_more_slowly(simulated):
     assert 0.002 < light - heavy < 0.02
 
 
-def test_pusher_follows_its_velocity_exactly_and_pushes_what_it_meets(simulated):
+def test_pusher_follows_its_velocity_exactly_pushes_what_it_meets_and_stops_at_its_reach(simulated):
     physics = simulated()
     physics.place("box", Pose(np.array([0.0, 0, 0.02]), LEVEL))
     start = np.array([-0.1, 0.0, PUSHER_CENTRE_Z_M])
@@ -95,10 +94,6 @@ def test_pusher_follows_its_velocity_exactly_and_pushes_what_it_meets(simulated)
     assert frozenset() == touched[0]
     assert -0.001 < physics.distance("box", None) < 0.01
     assert physics.pose("box").position[0] > 0.01
-
-
-def test_pusher_stops_at_its_reach(simulated):
-    physics = simulated()
     physics.place_pusher(np.array([PUSHER_REACH_M - 0.01, 0, PUSHER_CENTRE_Z_M]))
     for _ in range(SUBSTEPS):
         physics.step(np.array([0.3, 0.3, 0]))

@@ -12,7 +12,6 @@ from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, WORKSPACE_HALF_M
 from osfcore.world.imaging import Lamp, TableSurface
 from osfcore.world.physics import Physics, body_model
 from osfcore.world.scenes import Conditions, SceneRequest, is_calm, move_apart, place_randomly, refuse_overlaps, settle
-from osfcore.world.tabletop import Tabletop
 from tests.core.world.boxes import box_asset
 from tests.support.errors import about
 
@@ -85,21 +84,10 @@ def test_boxes_are_moved_apart_as_little_as_needed(place, expected_a, expected_b
 CAMERAS = default_cameras(48)
 
 
-@pytest.fixture
-def world_with(library):
-    """Makes worlds, and closes them."""
-    with contextlib.ExitStack() as stack:
-        yield lambda conditions, **given: stack.enter_context(
-            contextlib.closing(Tabletop(library, cameras=CAMERAS, conditions=conditions, **given))
-        )
-
-
 @pytest.mark.slow
-def test_a_world_is_seen_under_its_lamp_and_on_its_table(world_with):
+def test_a_world_is_seen_under_its_lamp_and_on_its_table(tables):
     changed = (None, Conditions(lamp=Lamp(intensity=0.5)), Conditions(table=TableSurface((0.2, 0.3, 0.6))))
-    usual, dim, blue = (world_with(conditions) for conditions in changed)
-    for world in (usual, dim, blue):
-        world.arrange(0)
+    usual, dim, blue = (tables(0, conditions=conditions) for conditions in changed)
     a, b, c = ([p.rgb[p.coverage.max(axis=0) > 0.999] for p in w.pictures(CAMERAS)] for w in (usual, dim, blue))
     for mine, halved, same in zip(a, b, c, strict=True):
         np.testing.assert_allclose(halved, 0.5 * mine, atol=1e-6)
@@ -108,12 +96,13 @@ def test_a_world_is_seen_under_its_lamp_and_on_its_table(world_with):
     np.testing.assert_allclose(open_table[0] / open_table[2], 1 / 3, rtol=1e-3)
 
 
-def test_objects_slide_farther_on_less_friction(world_with):
+def test_objects_slide_farther_on_less_friction(tables):
     """In proportion, as Coulomb has it."""
     slid = []
     for factor in (0.5, 1.0, 2.0):
-        world = world_with(Conditions(friction_factor=factor), request=SceneRequest(names=("009_gelatin_box",)))
-        world.arrange(1)
+        world = tables(
+            1, conditions=Conditions(friction_factor=factor), request=SceneRequest(names=("009_gelatin_box",))
+        )
         state = world.truth()
         assert state.poses.position[0, 2] < 0.02  # it lies flat
         world.restore(replace(state, pusher=np.array([*state.poses.position[0, :2] - [0.07, 0], PUSHER_CENTRE_Z_M])))
@@ -132,12 +121,10 @@ def test_factors_that_no_world_has_are_refused(factor):
             Conditions(**{f"{what}_factor": factor})
 
 
-def test_a_near_lamp_takes_the_place_of_the_scenes_light(world_with):
+def test_a_near_lamp_takes_the_place_of_the_scenes_light(tables):
     """In pictures, and in the truth as the direction in which it stands; the rest of the scene stays as it is."""
     spot = SpotLamp(np.array([0.2, -0.1, 0.5]), np.zeros(3), 20, 25)
-    usual, near = (world_with(c) for c in (None, Conditions(spot=spot)))
-    for world in (usual, near):
-        world.arrange(2)
+    usual, near = (tables(2, conditions=conditions) for conditions in (None, Conditions(spot=spot)))
     np.testing.assert_array_equal(usual.truth().poses.position, near.truth().poses.position)
     np.testing.assert_allclose(near.truth().light.direction, spot.direction, atol=1e-12)
     first = near.observe().images

@@ -1,3 +1,4 @@
+import contextlib
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +17,9 @@ BOX, CAN, GELATIN = NAMES = ("003_cracker_box", "005_tomato_soup_can", "009_gela
 
 @pytest.fixture(scope="module")
 def world(library):
-    tabletop = Tabletop(library, request=SceneRequest(names=NAMES))
-    tabletop.arrange(0)
-    yield tabletop
-    tabletop.close()
+    with contextlib.closing(Tabletop(library, request=SceneRequest(names=NAMES))) as tabletop:
+        tabletop.arrange(0)
+        yield tabletop
 
 
 @pytest.fixture(scope="module")
@@ -29,9 +29,8 @@ def start(world):
 
 @pytest.fixture
 def simulated(world):
-    model = SimulatedPushes(world.assets)
-    yield model
-    model.close()
+    with contextlib.closing(SimulatedPushes(world.assets)) as model:
+        yield model
 
 
 def push(state, name: str, after: int = 2) -> np.ndarray:
@@ -73,9 +72,8 @@ def test_sequences_do_not_influence_each_other(world, start, simulated):
     one = push(start, CAN, 0)
     other = np.resize(push(start, BOX, 0), one.shape)
     together = simulated.rollout(start, np.stack([one, other, one]))
-    fresh = SimulatedPushes(world.assets)
-    alone = fresh.rollout(start, one[None])
-    fresh.close()
+    with contextlib.closing(SimulatedPushes(world.assets)) as fresh:
+        alone = fresh.rollout(start, one[None])
     for k in (0, 2):
         np.testing.assert_allclose(together.positions[k], alone.positions[0], atol=2e-3)
     np.testing.assert_array_equal(together.positions[:, 0], np.broadcast_to(start.poses.position, (3, 3, 3)))
