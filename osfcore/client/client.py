@@ -32,7 +32,7 @@ from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.io.files import file_at_once
 from osfcore.io.image_file import encode_png, to_uint8
-from osfcore.io.json_codec import Entry, decode
+from osfcore.io.json_codec import Entry, decode, encode
 from osfcore.io.scene_file import (
     CameraJson,
     EstimateJson,
@@ -233,18 +233,6 @@ class Connection:
     def __init__(self, http: httpx2.Client) -> None:
         self._http = http
 
-    @staticmethod
-    def to(url: str, token: str | None, timeout_s: float) -> Connection:
-        """Connect to an address.
-
-        Args:
-            url: such as http://127.0.0.1:8000.
-            token: of a service that was started with one.
-            timeout_s: how long an answer may take [s].
-        """
-        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        return Connection(httpx2.Client(base_url=url, headers=headers, timeout=timeout_s))
-
     def close(self) -> None:
         """Release the sockets."""
         self._http.close()
@@ -369,7 +357,8 @@ class Client:
         timeout_s: float = 60.0,
         connection: Connection | None = None,
     ) -> None:
-        self._service = connection or Connection.to(url, token, timeout_s)
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self._service = connection or Connection(httpx2.Client(base_url=url, headers=headers, timeout=timeout_s))
 
     def __enter__(self) -> Self:
         """Itself."""
@@ -513,13 +502,12 @@ class Client:
             prior: the earlier estimate of mode "next" and "goal"; the latest of the table otherwise.
             seed: of the search.
         """
+        place, asked = "/api/estimates", {"mode": mode, "prior": prior, "seed": seed}
         if observation is None:
-            body = {"mode": mode, "scene": scene, "prior": prior, "seed": seed}
-            data = self._service.json("POST", "/api/estimates", body)
+            data = self._service.json("POST", place, {**asked, "scene": scene})
         else:
-            query = {"mode": mode, "prior": prior, "seed": seed}
-            data = self._service.send("POST", "/api/estimates", _zipped(Path(observation)), "application/zip", **query)
-        return self._followed("/api/estimates", data, Estimate)
+            data = self._service.send("POST", place, _zipped(Path(observation)), "application/zip", **asked)
+        return self._followed(place, data, Estimate)
 
     def predict(self, actions: Float[np.ndarray, "K T 3"], state: SceneState | None = None) -> Rollouts:
         """Predict what sequences of pusher velocities would do.
@@ -578,10 +566,8 @@ class Client:
             file: such as "video.mp4" or "report.json".
             to: a file, or a folder to put it into.
         """
-        place = Path(to)
-        return self._service.download(
-            f"/api/episodes/{episode.id}/files/{file}", place / file if place.is_dir() else place
-        )
+        place = Path(to) / file if Path(to).is_dir() else Path(to)
+        return self._service.download(f"/api/episodes/{episode.id}/files/{file}", place)
 
     def _shown(self) -> str:
         current = self._service.json("GET", "/api/scenes")["current"]
@@ -606,10 +592,7 @@ def _light(light: Light | None) -> dict[str, Any] | None:
 
 
 def _poses(poses: Mapping[str, Pose]) -> list[dict[str, Any]]:
-    return [
-        {"name": name, "position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
-        for name, pose in poses.items()
-    ]
+    return [encode(ObjectJson.of(name, pose)) for name, pose in poses.items()]
 
 
 def _image(content: bytes) -> Float32[np.ndarray, "h w 3"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from urllib.parse import SplitResult, parse_qsl, urlsplit
 
-from osfcore.errors import InvalidInput, UnknownName
+from osfcore.errors import InvalidInput, check_known
 from osfcore.extras import need
 from osfcore.robots.http_robot import HttpRobot
 from osfcore.robots.robot import Robot, SafetyLimits
@@ -36,9 +36,7 @@ def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None =
     from osfcore.robots.ros_robot import RosNames, RosRobot
 
     asked = dict(parse_qsl(parts.query))
-    for name in asked:
-        if name not in _ROS_NAMES:
-            raise UnknownName("part of a robot's address", name, _ROS_NAMES)
+    check_known("part of a robot's address", asked, _ROS_NAMES)
     cameras = tuple(filter(None, asked.pop("cameras", "").split(",")))
     address = f"ws://{f'[{host}]' if ':' in host else host}:{port or _ROS_PORT}"
     return RosRobot(address, RosNames(cameras, **asked), names, limits or SafetyLimits())

@@ -6,12 +6,13 @@ import contextlib
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
 
 from osfcore.control.world import World, without_cameras
-from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.errors import InvalidInput, OsfError, check_known
 from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import STEP_S, check_action
@@ -191,16 +192,11 @@ class OutlinedWorld:
             InvalidInput: if no camera has a box around each object, or nothing is found in one.
         """
         seen = self._world.observe(masks=masks)
-        return self._outlined(seen) if masks and seen.masks is None else seen
-
-    def _outlined(self, seen: Observation) -> Observation:
+        if not masks or seen.masks is not None:
+            return seen
         cameras = [camera.name for camera in seen.cameras]
-        for camera, boxes in self._boxes.items():
-            if camera not in cameras:
-                raise UnknownName("camera", camera, cameras)
-            for name in boxes:
-                if name not in seen.names:
-                    raise UnknownName("object on the table", name, seen.names)
+        check_known("camera", self._boxes, cameras)
+        check_known("object on the table", chain.from_iterable(self._boxes.values()), seen.names)
         unmarked = frozenset(camera for camera in cameras if set(self._boxes.get(camera, ())) != set(seen.names))
         if len(unmarked) == len(cameras):
             allowed = "around each object in at least one camera, for the robot delivers no masks"
@@ -208,14 +204,10 @@ class OutlinedWorld:
         marked = without_cameras(seen, unmarked)
         pictures = [to_uint8(srgb_of_linear(image)) for image in marked.images]
         pairs = zip(marked.cameras, pictures, strict=True)
-        masks = np.stack([_outlines(picture, self._boxes[camera.name], seen.names) for camera, picture in pairs])
-        return replace(marked, masks=masks)
-
-
-def _outlines(
-    picture: UInt8[np.ndarray, "h w 3"], boxes: Mapping[str, Box], names: tuple[str, ...]
-) -> Bool[np.ndarray, "N h w"]:
-    """Run GrabCut from each box; a click in its middle marks the object, and background of the others."""
-    clicks = {name: np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]) for name, (x0, y0, x1, y1) in boxes.items()}
-    found = propose_masks(picture, boxes, clicks)
-    return np.stack([found[name] for name in names])
+        masks = []
+        for camera, picture in pairs:  # a click in a box's middle marks the object, and background of the others
+            boxes = self._boxes[camera.name]
+            clicks = {name: np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]) for name, (x0, y0, x1, y1) in boxes.items()}
+            found = propose_masks(picture, boxes, clicks)
+            masks.append([found[name] for name in seen.names])
+        return replace(marked, masks=np.array(masks))

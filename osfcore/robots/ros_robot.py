@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import contextlib
 import json
 import threading
 import time
@@ -231,18 +232,15 @@ class Rosbridge:
 
     def _take(self, text: str | bytes) -> None:
         """Keep a published message; others, such as a status, are not needed."""
-        try:
+        content = None
+        with contextlib.suppress(ValueError):
             content = json.loads(text)
-        except ValueError:
-            return
-        if not isinstance(content, dict) or content.get("op") != "publish" or not isinstance(content.get("msg"), dict):
-            return
-        topic = str(content.get("topic"))
-        if topic in self._messages:
-            with self._news:
-                self._messages[topic].append(content["msg"])
-                self._counts[topic] += 1
-                self._news.notify_all()
+        match content:
+            case {"op": "publish", "topic": str(topic), "msg": dict(message)} if topic in self._messages:
+                with self._news:
+                    self._messages[topic].append(message)
+                    self._counts[topic] += 1
+                    self._news.notify_all()
 
 
 _TWIST_EVERY_S = 0.05  # more often than any controller gives up on its commands
@@ -324,7 +322,13 @@ class RosRobot:
         self._sending = threading.Lock()
         self._bridge = Rosbridge(url, timeout_s)
         try:
-            self._subscribe()
+            for camera in topics.cameras:
+                info, image = topics.topic(camera, topics.info), topics.topic(camera, topics.image)
+                self._bridge.subscribe(info, "sensor_msgs/msg/CameraInfo", every_ms=1000)
+                self._bridge.subscribe(image, "sensor_msgs/msg/CompressedImage", every_ms=_PICTURES_EVERY_MS)
+            for topic in _TRANSFORMS:
+                self._bridge.subscribe(topic, "tf2_msgs/msg/TFMessage", kept=_TRANSFORMS_KEPT)
+            self._bridge.send(op="advertise", topic=topics.twist, type="geometry_msgs/msg/TwistStamped")
             self._cameras = self._described_cameras()
             cameras = tuple(camera.kept() for camera in self._cameras)
         except OsfError:
@@ -391,16 +395,6 @@ class RosRobot:
         """Close the connection."""
         self._bridge.close()
 
-    def _subscribe(self) -> None:
-        bridge, topics = self._bridge, self._topics
-        for camera in topics.cameras:
-            bridge.subscribe(topics.topic(camera, topics.info), "sensor_msgs/msg/CameraInfo", every_ms=1000)
-            image = topics.topic(camera, topics.image)
-            bridge.subscribe(image, "sensor_msgs/msg/CompressedImage", every_ms=_PICTURES_EVERY_MS)
-        for topic in _TRANSFORMS:
-            bridge.subscribe(topic, "tf2_msgs/msg/TFMessage", kept=_TRANSFORMS_KEPT)
-        bridge.send(op="advertise", topic=topics.twist, type="geometry_msgs/msg/TwistStamped")
-
     def _described_cameras(self) -> tuple[SentCamera, ...]:
         topics = {camera: self._topics.topic(camera, self._topics.info) for camera in self._topics.cameras}
         self._wait(dict.fromkeys(topics.values(), 1))
@@ -409,13 +403,11 @@ class RosRobot:
             for camera, topic in topics.items()
         }
         tree = self._complete_tree([*(info.header.frame_id for info in infos.values()), self._topics.pusher])
-        return tuple(
-            SentCamera(
-                camera, tree.pose(info.header.frame_id, self._topics.table), np.reshape(info.k, (3, 3)) + _HALF_PIXEL,
-                info.width, info.height, tuple(info.d),
-            )
-            for camera, info in infos.items()
-        )  # fmt: skip
+        described = []
+        for camera, info in infos.items():
+            pose, K = tree.pose(info.header.frame_id, self._topics.table), np.reshape(info.k, (3, 3)) + _HALF_PIXEL
+            described.append(SentCamera(camera, pose, K, info.width, info.height, tuple(info.d)))
+        return tuple(described)
 
     def _complete_tree(self, frames: list[str]) -> TransformTree:
         """Wait for transforms that lead from the table to all frames; raise the error of the first frame without."""

@@ -7,16 +7,11 @@ from osfcore.extras import PACKAGES, MissingExtra, missing, need, told_of
 from tests.support.errors import about
 
 
-def without(monkeypatch, *packages):
-    """As if packages were not installed."""
-    found = importlib.util.find_spec
-    monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None if name in packages else found(name))
-
-
 def test_missing_packages_are_named_with_their_extra(monkeypatch):
     for extra in PACKAGES:
         need(extra, "This")
-    without(monkeypatch, "viser", "uvicorn", "pybullet")
+    absent, found = ("viser", "uvicorn", "pybullet"), importlib.util.find_spec
+    monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None if name in absent else found(name))
     assert missing("serve") == ["uvicorn", "viser", "pybullet"]
     with pytest.raises(MissingExtra, check=about("viser")) as error:
         need("serve", "The service")
@@ -24,10 +19,6 @@ def test_missing_packages_are_named_with_their_extra(monkeypatch):
     failed = told_of(ModuleNotFoundError("none", name="pybullet.client"), "This command")
     assert (failed.extra, failed.missing) == ("sim", ["pybullet"])
     assert told_of(ModuleNotFoundError("none", name="teapot"), "This command") is None
-
-
-def test_pybullet_is_not_promised_where_it_has_no_wheels(monkeypatch):
-    without(monkeypatch, "pybullet")
-    assert "3.11" not in str(MissingExtra("It", "sim", missing("sim")))
-    monkeypatch.setattr(sys, "version_info", (3, 13, 0))
-    assert "3.11" in str(MissingExtra("It", "sim", missing("sim")))
+    assert "3.11" not in str(failed)
+    monkeypatch.setattr(sys, "version_info", (3, 13, 0))  # PyBullet is not promised where it has no wheels
+    assert "3.11" in str(MissingExtra("It", "sim", ["pybullet"]))

@@ -111,7 +111,8 @@ class StandIn:
         while not self._ends.wait(0.005):
             now = time.monotonic()
             self._halt_without_twists()
-            self.pusher = self.pusher + (now - before) * np.array([*self.velocity, 0.0])
+            if self.velocity.any():  # a test may put it elsewhere meanwhile
+                self.pusher = self.pusher + (now - before) * np.array([*self.velocity, 0.0])
             before = now
 
     def _halt_without_twists(self):

@@ -140,16 +140,18 @@ def test_it_asks_once_before_the_first_motion_and_nothing_moves_if_nobody_allows
     assert "start" not in world.told
 
 
-def test_after_a_stop_every_action_is_refused_with_the_first_reason():
-    world = Marble()
+def test_after_a_stop_every_action_is_refused_with_the_first_reason_and_closing_stops_again():
+    world = Marble(fails={"stop": ConnectionLost("http://robot", "cut")})  # which is no other error
     guard = guarded(world)
     guard.act(RIGHT)
     guard.stop("a key was pressed")
+    assert guard.observe().pusher is not None
     guard.stop("for another reason")
     for _ in range(2):
         with pytest.raises(RobotStopped, check=about("a key was pressed")):
             guard.act(RIGHT)
-    assert world.told == ["start", "stop", "stop"]
+    guard.close()
+    assert world.told == ["start", "stop", "stop", "stop", "close"]
 
 
 def test_a_stop_from_another_thread_ends_a_motion_that_is_under_way():
@@ -189,42 +191,17 @@ def test_whatever_goes_wrong_stops_the_robot(what, error):
         guard.act(RIGHT)
 
 
-def test_a_robot_that_cannot_be_stopped_is_no_other_error():
-    guard = guarded(Marble(fails={"stop": ConnectionLost("http://robot", "cut")}))
-    guard.act(RIGHT)
-    guard.stop("a key was pressed")
-    with pytest.raises(RobotStopped, check=about("a key")):
-        guard.act(RIGHT)
-    assert guard.observe().pusher is not None
-
-
-def test_closing_stops_and_releases():
-    world = Marble()
-    guard = guarded(world)
-    guard.act(RIGHT)
-    guard.close()
-    assert world.told == ["start", "stop", "close"]
-
-
-@pytest.mark.parametrize(
-    ("box", "speed", "what"),
-    [
-        ((0.1, 0.0, -0.1, 0.1), 0.1, "safety box"),
-        ((0.0, 0.0, float("nan"), 0.1), 0.1, "safety box"),
-        (BOX, 0.0, "top speed"),
-        (BOX, 50.0, "top speed"),
-    ],
-)
-def test_limits_that_are_none_are_refused(box, speed, what):
-    with pytest.raises(InvalidInput, check=about(what)):
-        SafetyLimits(box, speed)
-
-
-def test_two_limits_hold_together():
+def test_two_limits_hold_together_and_limits_that_are_none_are_refused():
     both = LIMITS.within(SafetyLimits((0.0, 0.0, 0.3, 0.3), 0.05))
     assert (both.box, both.top_speed_m_s) == ((0.0, 0.0, 0.12, 0.2), 0.05)
     with pytest.raises(InvalidInput, check=about("safety box")):
         LIMITS.within(SafetyLimits((0.2, 0.2, 0.3, 0.3)))
+    for box in ((0.1, 0.0, -0.1, 0.1), (0.0, 0.0, float("nan"), 0.1)):
+        with pytest.raises(InvalidInput, check=about("safety box")):
+            SafetyLimits(box)
+    for speed in (0.0, 50.0):
+        with pytest.raises(InvalidInput, check=about("top speed")):
+            SafetyLimits(BOX, speed)
 
 
 # Masks from boxes

@@ -17,6 +17,7 @@ from tests.live import free_port
 from tests.support.errors import about
 from tests.support.robots import until
 from tests.support.ros_robots import CAMERAS, StandIn, transform
+from tests.support.same import assert_same
 
 FAST = SafetyLimits(top_speed_m_s=0.42)
 LEFT = np.array([-0.3, 0.1, 0.0])
@@ -41,15 +42,9 @@ def short(stand_in, cameras=("left", "right"), timeout_s=0.4):
     return RosRobot(address, RosNames(cameras), (), FAST, timeout_s)
 
 
-def test_cameras_are_where_the_transforms_put_them(robot):
-    for camera in robot.description.cameras:
-        true = CAMERAS[camera.name]
-        np.testing.assert_allclose(camera.T_world_camera.matrix(), true.T_world_camera.matrix(), atol=1e-9)
-        np.testing.assert_allclose(camera.intrinsics, true.intrinsics, atol=1e-12)
+def test_cameras_are_where_the_transforms_put_them_and_send_pictures_beside_the_pusher(robot, stand_in):
+    assert_same(robot.description.cameras, tuple(CAMERAS.values()), atol=1e-9)
     assert robot.description.limits == FAST
-
-
-def test_pictures_and_pusher_come(robot, stand_in):
     stand_in.pusher = np.array([0.05, -0.1, 0.06])
     seen = robot.observe(masks=True)
     np.testing.assert_allclose(seen.images, linear_of_srgb(np.array(100 / 255)), atol=0.01)
@@ -67,7 +62,10 @@ def test_pictures_are_newer_than_the_question(robot, stand_in):
     assert not stand_in.silent
 
 
-def test_velocities_are_sent_in_the_frame_of_the_table_until_they_are_over(robot, stand_in):
+def test_velocities_are_sent_in_the_frame_of_the_table_once_it_is_started_until_they_are_over(robot, stand_in):
+    with pytest.raises(RobotRefused):
+        robot.act(LEFT)
+    assert stand_in.twists == []
     robot.start()
     robot.act(LEFT)
     until(lambda: stand_in.twists and not stand_in.twists[-1].any())
@@ -75,12 +73,6 @@ def test_velocities_are_sent_in_the_frame_of_the_table_until_they_are_over(robot
     assert len(stand_in.twists) >= 3
     np.testing.assert_allclose(stand_in.twists[0], LEFT[:2], atol=1e-12)
     assert stand_in.pusher[0] < -0.02
-
-
-def test_nothing_moves_before_it_is_started(robot, stand_in):
-    with pytest.raises(RobotRefused):
-        robot.act(LEFT)
-    assert stand_in.twists == []
 
 
 def test_nothing_follows_the_zero_of_a_stop_from_another_thread(robot, stand_in):
@@ -124,18 +116,15 @@ def test_what_is_not_published_is_named(stand_in, topic, subject):
         short(stand_in)
 
 
-def test_pictures_that_do_not_come_are_named(stand_in):
+def test_pictures_that_do_not_come_are_named_and_damaged_ones_refused(stand_in):
     with contextlib.closing(short(stand_in)) as robot:
+        for data in ("no base64", "QUJD"):
+            stand_in.extra["/left/image_raw/compressed"] = {"data": data}
+            with pytest.raises(CorruptFile):
+                robot.observe()
         stand_in.silent.add("/right/image_raw/compressed")
         with pytest.raises(RobotRefused, check=about("/right/image_raw/compressed")):
             robot.observe()
-
-
-@pytest.mark.parametrize("data", ["no base64", "QUJD"])
-def test_damaged_pictures_are_refused(robot, stand_in, data):
-    stand_in.extra["/left/image_raw/compressed"] = {"data": data}
-    with pytest.raises(CorruptFile):
-        robot.observe()
 
 
 def test_a_camera_that_is_not_calibrated_is_refused(stand_in):
@@ -164,18 +153,13 @@ def test_poses_are_composed_along_the_tree_both_ways(seed):
     camera, table, mount = (Pose(one[:3], quaternion_exp(one[3:])) for one in drawn)
     tree = TransformTree(
         [{"transforms": [transform("base", "mount", mount), transform("/mount", "camera", camera)]},
-         {"transforms": [transform("base", "table", table)]}]
+         {"transforms": [transform("base", "table", mount)]},
+         {"transforms": [transform("base", "table", table)]}]  # what came last counts
     )  # fmt: skip
     found = tree.pose("camera", "table")
     np.testing.assert_allclose(found.matrix(), (table.inverse() @ mount @ camera).matrix(), atol=1e-9)
     np.testing.assert_allclose(tree.pose("table", "camera").matrix(), found.inverse().matrix(), atol=1e-9)
     np.testing.assert_allclose(tree.pose("table", "table").matrix(), np.eye(4), atol=1e-12)
-
-
-def test_what_came_last_counts():
-    first, last = (Pose(np.array([x, 0, 0]), np.array([1.0, 0, 0, 0])) for x in (1.0, 2.0))
-    tree = TransformTree([{"transforms": [transform("table", "pusher", pose)]} for pose in (first, last)])
-    np.testing.assert_allclose(tree.pose("pusher", "table").position, [2, 0, 0], atol=1e-12)
 
 
 def test_unconnected_frames_and_broken_rotations_are_refused():
