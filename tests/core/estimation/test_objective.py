@@ -189,9 +189,7 @@ def test_around_are_windows_that_hold_the_object(plain, params, views):
             np.testing.assert_allclose(residuals(plain, window, batch), 0, atol=ROUNDING)
         shown = plain.together.render(batch, own.cameras, quality=QUALITY, outputs={"opacity"}).opacity[0, :, number]
         np.testing.assert_allclose(shown.sum(axis=(1, 2)), views.masks[:, number].sum(axis=(1, 2)), rtol=1e-3)
-
-
-def test_around_leaves_out_cameras_that_look_elsewhere(plain, params):
+    # Cameras that look elsewhere are left out.
     away = view((0.5, 0, 0.4), (1.0, 0, 0.5), 64)
     both = own_views(plain, params, [CAMERAS[0], away])
     assert len(crop_to_object(both, plain, params, 0).cameras) == 1
@@ -245,16 +243,12 @@ PLACE = np.array([0.02, -0.03, 0.12])
 MASKED_CAMERAS = default_cameras(48)[:2]
 
 
-def part_that_shows(look, number=0) -> ObjectView:
-    mask = look.opacity[number]
-    area = mask.sum(axis=(1, 2))
-    return ObjectView(MASKED_CAMERAS, look.rgb[number], mask, np.ones(mask.shape, bool), area, QUALITY)
-
-
 @pytest.fixture(scope="module")
 def part(models):
     bare = ObjectView(MASKED_CAMERAS, *[np.zeros(0)] * 4, QUALITY)
-    return part_that_shows(render_poses(models, BOX, bare, Pose(PLACE[None], np.array([UPRIGHT])), MASKED_LIGHT))
+    look = render_poses(models, BOX, bare, Pose(PLACE[None], np.array([UPRIGHT])), MASKED_LIGHT)
+    (mask,) = look.opacity
+    return ObjectView(MASKED_CAMERAS, look.rgb[0], mask, np.ones(mask.shape, bool), mask.sum(axis=(1, 2)), QUALITY)
 
 
 def loss_at(models, part, shifts, **how):
@@ -330,21 +324,16 @@ def test_a_box_lies_on_its_six_faces(box):
     np.testing.assert_allclose(turned, [[1, 0, 2], [0, 1, 2], [-1, 0, 2], [0, -1, 2]], atol=1e-12)
 
 
-def test_the_centre_of_mass_moves_with_the_object():
+def test_the_centre_of_mass_moves_with_the_object_and_its_lowest_corner_is_on_the_table():
     field = block(HALF)
     moved = replace(field, origin=field.origin + np.float32([0.01, -0.02, 0.03]))
-    here, there = (resting_orientations(field, yaws=1), resting_orientations(moved, yaws=1))
+    here, there = (resting_orientations(one, yaws=2) for one in (field, moved))
     np.testing.assert_allclose(here.centre, 0, atol=1e-4)
     np.testing.assert_allclose(there.centre, [0.01, -0.02, 0.03], atol=1e-4)
     np.testing.assert_allclose(there.heights, here.heights, atol=1e-4)
-
-
-def test_the_lowest_solid_corner_is_on_the_table():
-    field = block(HALF)
     points = field.origin + field.voxel * np.argwhere(field.density > 2)
-    resting = resting_orientations(field, yaws=2)
-    for quaternion, height in zip(resting.quaternions, resting.heights, strict=True):
-        z = rotate(quaternion, points - resting.centre)[:, 2]
+    for quaternion, height in zip(here.quaternions, here.heights, strict=True):
+        z = rotate(quaternion, points - here.centre)[:, 2]
         assert z.min() + height == pytest.approx(0, abs=1e-6)
-        lifted = Pose(np.array([0.3, -0.2, height + 0.05]) - rotate(quaternion, resting.centre), quaternion)
-        assert resting.lowest(lifted) == pytest.approx(0.05, abs=1e-6)
+        lifted = Pose(np.array([0.3, -0.2, height + 0.05]) - rotate(quaternion, here.centre), quaternion)
+        assert here.lowest(lifted) == pytest.approx(0.05, abs=1e-6)

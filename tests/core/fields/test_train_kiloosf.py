@@ -286,9 +286,7 @@ def test_a_student_begins_with_the_teachers_density_and_albedo_and_dipoles_that_
     with torch.no_grad():
         ours = torch.nn.functional.normalize(query.features(x)[:, 4:7], dim=-1)
     assert torch.quantile((ours * normals(x)).sum(-1), 0.1) > 0.9
-
-
-def test_the_grid_holds_all_density_and_drops_the_unseen_inside(student):
+    # The grid holds all density and drops the unseen inside.
     low, high = student.box
     assert np.all(low < CENTRE - 1.05 * HALF)
     assert np.all(high > CENTRE + 1.05 * HALF)

@@ -48,7 +48,7 @@ def seen(field, camera, light=(0.0, 0.0, 1.0)):
         return composite(KiloQuery(field), field, rays, min_weight=1e-5, most=400)
 
 
-def test_training_sees_what_the_renderer_draws():
+def test_training_sees_what_the_renderer_draws_and_black_where_rays_meet_nothing():
     """A lone object over black, sample by sample the same."""
     for seed in (0, 5):
         field = random_field(np.random.default_rng(seed))
@@ -58,9 +58,6 @@ def test_training_sees_what_the_renderer_draws():
         drawn = SceneRenderer({"it": field}, None).render(scene, [camera], outputs={"rgb", "opacity"})
         np.testing.assert_allclose(colour.reshape(24, 24, 3), drawn.rgb[0, 0], atol=2e-3)
         np.testing.assert_allclose(alpha.reshape(24, 24), drawn.opacity[0, 0, 0], atol=2e-3)
-
-
-def test_rays_that_meet_nothing_are_black():
     colour, alpha = seen(ball(), view((0.5, 0, 0), (1, 0, 0), 16))
     assert not colour.any()
     assert not alpha.any()

@@ -13,6 +13,7 @@ from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
 from tests.core.dynamics.scenes import CAN, GELATIN, boxes, scene
 from tests.support.errors import about
+from tests.support.rendered_scenes import UPRIGHT, state
 
 # Image cost
 
@@ -67,14 +68,8 @@ def test_costs_are_those_of_each_future_alone_summed_over_the_horizon_without_th
 # Pose cost
 
 
-UPRIGHT = np.array([1.0, 0, 0, 0])
-STATE = SceneState(
-    ("a", "b"),
-    Pose(np.array([[0.1, 0.0, 0.02], [-0.1, 0.05, 0.03]]), np.stack([UPRIGHT, UPRIGHT])),
-    Light(np.array([0.0, 0, 1])),
-    np.array([0.0, 0.0, 0.06]),
-)
-THERE = Pose(np.array([0.1, 0.2, 0.02]), UPRIGHT)
+STATE = state({"a": (0.1, 0.0, 0.02), "b": (-0.1, 0.05, 0.03)}, (0, 0, 1), (0, 0, 0.06))
+THERE = Pose(np.array([0.1, 0.2, 0.02]), np.array(UPRIGHT))
 
 
 def futures_by_pose(*last, turn: float = 0.0, steps: int = 3) -> Rollouts:

@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 from osfcore.dynamics.rollout import load_push_model, load_shapes
 from osfcore.dynamics.shapes import ShapeTable, part_outlines
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, quaternion_to_matrix, rotation_angle
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S, WORKSPACE_HALF_M
 from osfcore.planning.costs import PoseCost, PoseGoal, object_costs
 from osfcore.planning.paths import CLEARANCE_M, FreeSpace, actions_along
@@ -27,6 +25,7 @@ from osfcore.planning.pushes import (
     straight_pushes,
 )
 from tests.core.dynamics.scenes import BOX, CAN, GELATIN, scene
+from tests.support.rendered_scenes import state
 
 # Push order
 
@@ -113,12 +112,7 @@ def test_an_object_is_pushed_around_a_wall():
 
 
 CENTRE = np.array([0.0, 0.0, 0.01])
-STATE = SceneState(
-    ("box",),
-    Pose(np.array([[0.1, -0.05, 0.02]]), UPRIGHT[None]),
-    Light(np.array([0.0, 0.0, 1.0])),
-    np.array([0.3, 0.3, 0.06]),
-)
+STATE = state({"box": (0.1, -0.05, 0.02)}, (0, 0, 1), (0.3, 0.3, 0.06))
 ORIGIN = STATE.poses.position[0, :2]
 
 
@@ -265,12 +259,7 @@ def test_what_is_there_or_nearly_is_not_pushed_on_purpose(shapes):
 
 HANDLE = np.array([-0.03, 0.0])  # of an object: at its left
 PLACES = {"a": (-0.1, 0.1), "b": (0.0, -0.1)}
-RECOMBINED_STATE = SceneState(
-    tuple(PLACES),
-    Pose(np.array([[*place, 0.01] for place in PLACES.values()]), np.tile([1.0, 0, 0, 0], (2, 1))),
-    Light(np.array([0.0, 0.0, 1.0])),
-    np.array([-0.25, 0.0, 0.06]),
-)
+RECOMBINED_STATE = state({name: (*place, 0.01) for name, place in PLACES.items()}, (0, 0, 1), (-0.25, 0.0, 0.06))
 GOAL = PoseGoal(
     RECOMBINED_STATE.names,
     Pose(RECOMBINED_STATE.poses.position + [[0.12, 0.0, 0.0], [0.15, 0.0, 0.0]], RECOMBINED_STATE.poses.quaternion),
