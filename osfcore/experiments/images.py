@@ -93,13 +93,9 @@ def common_names(
 
 def known_names(method: str, fields: FieldLibrary, data_dir: Path | None) -> tuple[str, ...]:
     """Return the objects that a method has a field of; ours for methods without fields of their own."""
-    match method:
-        case "paper":
-            return paper_field_names(data_dir)
-        case "nerf":
-            return nerf_library(data_dir).names()
-        case _:
-            return fields.names()
+    if method == "paper":
+        return paper_field_names(data_dir)
+    return (nerf_library(data_dir) if method == "nerf" else fields).names()
 
 
 def field_path(method: str, name: str, fields: FieldLibrary, data_dir: Path | None) -> Path:
@@ -108,13 +104,9 @@ def field_path(method: str, name: str, fields: FieldLibrary, data_dir: Path | No
     Raises:
         UnknownName: if there is none.
     """
-    match method:
-        case "paper":
-            return paper_field_path(name, data_dir)
-        case "nerf":
-            return nerf_library(data_dir).info(name).path
-        case _:
-            return fields.info(name).path
+    if method == "paper":
+        return paper_field_path(name, data_dir)
+    return (nerf_library(data_dir) if method == "nerf" else fields).info(name).path
 
 
 def load_appearance(method: str, names: Iterable[str], fields: FieldLibrary, data_dir: Path | None) -> ObjectModels:
@@ -130,13 +122,9 @@ def load_appearance(method: str, names: Iterable[str], fields: FieldLibrary, dat
         UnknownName: if an object has no such field.
         CorruptFile: if a file is broken.
     """
-    match method:
-        case "paper":
-            return load_paper_appearance(names, fields, data_dir)
-        case "nerf":
-            return load_nerf_appearance(names, fields, data_dir)
-        case _:
-            return ObjectModels({name: fields.load(name) for name in names}, fields.load_table())
+    if method in ("paper", "nerf"):
+        return (load_paper_appearance if method == "paper" else load_nerf_appearance)(names, fields, data_dir)
+    return ObjectModels({name: fields.load(name) for name in names}, fields.load_table())
 
 
 def shown_circumstances(

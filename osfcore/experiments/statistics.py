@@ -16,20 +16,17 @@ _RESAMPLES = 9999
 
 def mean(values: Iterable[float | None]) -> float | None:
     """Return the mean of the values that are not None; None if there are none."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+    return float(np.mean(known)) if (known := [value for value in values if value is not None]) else None
 
 
 def median(values: Iterable[float | None]) -> float | None:
     """Return the median of the values that are not None; None if there are none."""
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
+    return float(np.median(known)) if (known := [value for value in values if value is not None]) else None
 
 
 def quantile(values: Iterable[float], share: float) -> float | None:
     """Return the value below which a share of the values lie; None without values."""
-    known = list(values)
-    return float(np.quantile(known, share)) if known else None
+    return float(np.quantile(known, share)) if (known := list(values)) else None
 
 
 def spread(name: str, values: Sequence[float], of: Sequence[str]) -> dict[str, float | None]:

@@ -144,12 +144,24 @@ def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...]
         base, tasks=scale.tasks, objects=scale.objects, settings=settings, actions=settings.steps, oracle=False,
         published=scale.published, foresight=scale.foresight,
     )  # fmt: skip
-    makers = {
-        "methods": _methods, "families": _families, "ablations": _ablations, "ladder": _ladder, "factors": _factors,
-        "attribution": _attribution,
-    }  # fmt: skip
-    sections = [section for name in SECTIONS if name in chosen for section in makers[name](base, scale)]
-    return tuple(section for section in sections if len(section.cells) > 1)
+    families = [Cell(f"goals {family}", replace(base, family=family)) for family in ("shifted", *scale.families)]
+    factors = [Cell("usual world", base)] + [Cell(name, replace(base, factor=name)) for name in scale.factors]
+    variants = {"ours": Variant(), "true light": Variant("known_light")}
+    variants |= {f"true {truth}": Variant(truths=frozenset({truth})) for truth in TRUTHS}
+    variants["all true"] = Variant(truths=frozenset(TRUTHS))
+    attributed = [Cell(label, replace(base, variant=variant)) for label, variant in variants.items()]
+    harder = "Harder goals: turned as well, in one another's places, photographed under another light."
+    differing = "One thing differs from what the method takes for granted, and it is not told."
+    replaced = "Each stage in turn is replaced by the truth: what its errors cost."
+    sections = (
+        *_methods(base, scale),
+        Section("families", "Families of tasks", harder, tuple(families)),
+        _ablations(base, scale),
+        _ladder(base, scale),
+        Section("factors", "Factors of variation", differing, tuple(factors)),
+        Section("attribution", "Where episodes fail", replaced, tuple(attributed)),
+    )
+    return tuple(section for section in sections if section.name in chosen and len(section.cells) > 1)
 
 
 def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
@@ -175,13 +187,7 @@ def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
     return sections
 
 
-def _families(base: EvaluateMpc, scale: Scale) -> list[Section]:
-    cells = [Cell(f"goals {family}", replace(base, family=family)) for family in ("shifted", *scale.families)]
-    text = "Harder goals: turned as well, in one another's places, photographed under another light."
-    return [Section("families", "Families of tasks", text, tuple(cells))]
-
-
-def _ablations(base: EvaluateMpc, scale: Scale) -> list[Section]:
+def _ablations(base: EvaluateMpc, scale: Scale) -> Section:
     plan = base.settings.plan
     cells = [Cell("ours", base), Cell("1 view", replace(base, variant=Variant(views=1)))]
     if scale.has_slow_cells:
@@ -198,10 +204,10 @@ def _ablations(base: EvaluateMpc, scale: Scale) -> list[Section]:
         f"Ours has four views, K = {plan.samples} sequences of T = {plan.horizon} actions and a cost of poses. "
         "Masks are given in the first frame alone, but for the last row: the paper's evaluation has them at every step."
     )
-    return [Section("ablations", "Ablations", text, tuple(cells))]
+    return Section("ablations", "Ablations", text, tuple(cells))
 
 
-def _ladder(base: EvaluateMpc, scale: Scale) -> list[Section]:
+def _ladder(base: EvaluateMpc, scale: Scale) -> Section:
     cells = [Cell("as published", replace(base, variant=Variant("paper")))]
     for count in range(1, len(_LADDER) - (not scale.has_slow_cells)):
         variant = Variant("paper", frozenset(_LADDER[:count]))
@@ -209,21 +215,7 @@ def _ladder(base: EvaluateMpc, scale: Scale) -> list[Section]:
     last = _LADDER[len(cells) - 1 :]
     cells.append(Cell(f"+ our {' and '.join(last)} = ours", base))
     text = "From the method as published to ours, one stage after another; each row keeps what those above it changed."
-    return [Section("ladder", "The ladder", text, tuple(cells))]
-
-
-def _factors(base: EvaluateMpc, scale: Scale) -> list[Section]:
-    cells = [Cell("usual world", base)] + [Cell(name, replace(base, factor=name)) for name in scale.factors]
-    text = "One thing differs from what the method takes for granted, and it is not told."
-    return [Section("factors", "Factors of variation", text, tuple(cells))]
-
-
-def _attribution(base: EvaluateMpc, _scale: Scale) -> list[Section]:
-    cells = [Cell("ours", base), Cell("true light", replace(base, variant=Variant("known_light")))]
-    cells += [Cell(f"true {truth}", replace(base, variant=Variant(truths=frozenset({truth})))) for truth in TRUTHS]
-    cells.append(Cell("all true", replace(base, variant=Variant(truths=frozenset(TRUTHS)))))
-    text = "Each stage in turn is replaced by the truth: what its errors cost."
-    return [Section("attribution", "Where episodes fail", text, tuple(cells))]
+    return Section("ladder", "The ladder", text, tuple(cells))
 
 
 # Measuring the cells of a report side by side, and what their results say next to each other.

@@ -155,7 +155,9 @@ class VisualForesight:
         for _ in range(self.settings.rounds):
             actions = self._sampled(rng)
             costs = self._costs(self._predictor.predict(context, actions, between=between))
-            self._mean = np.einsum("k,kta->ta", _weights(costs, self.settings.temperature), actions)
+            spread = max(float(np.median(costs) - costs.min()), 1e-12)
+            weights = np.exp(-(costs - costs.min()) / (self.settings.temperature * spread))
+            self._mean = np.einsum("k,kta->ta", weights / weights.sum(), actions)
         return ForesightPlan(self._mean, costs, time.perf_counter() - began)
 
     def shift(self) -> None:
@@ -176,12 +178,6 @@ class VisualForesight:
     def _costs(self, frames: Float[np.ndarray, "K T h w 3"]) -> Float[np.ndarray, "K"]:
         """Return the cost of each sequence, one after the other: all differences at once would double the memory."""
         return np.array([((video - self._goal) ** 2).mean(axis=(1, 2, 3), dtype=float).sum() for video in frames])
-
-
-def _weights(costs: Float[np.ndarray, "K"], temperature: float) -> Float[np.ndarray, "K"]:
-    spread = max(float(np.median(costs) - costs.min()), 1e-12)
-    weights = np.exp(-(costs - costs.min()) / (temperature * spread))
-    return weights / weights.sum()
 
 
 def foresee(
