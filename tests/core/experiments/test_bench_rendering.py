@@ -7,7 +7,6 @@ import osfcore.experiments.bench_rendering as module
 from osfcore.errors import InvalidInput, MissingAssets
 from osfcore.experiments.bench_rendering import BenchRender, bench_render, lay_out, rollouts, slope
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import rotate
 from osfcore.objects.asset_library import AssetLibrary
 from tests.support.errors import about
 from tests.support.solids import SOLIDS
@@ -42,17 +41,6 @@ def test_the_slope_is_the_power_of_growth():
     sizes = [1, 2, 4, 16]
     assert slope(sizes, [3 * n**1.5 for n in sizes]) == pytest.approx(1.5)
     assert slope([5], [1.0]) is None
-
-
-def test_objects_lie_on_the_table_in_places_of_their_own(library):
-    assets = [library.load(name) for name in SOLIDS] * 5
-    poses = lay_out(assets, np.random.default_rng(0))
-    assert np.abs(poses.position[:, :2]).max() <= 0.22
-    gaps = np.linalg.norm(poses.position[:, None, :2] - poses.position[None, :, :2], axis=-1)
-    assert gaps[~np.eye(15, dtype=bool)].min() > 0.03
-    for asset, position, quaternion in zip(assets, poses.position, poses.quaternion, strict=True):
-        lowest = (rotate(quaternion, asset.mesh.vertices) + position)[:, 2].min()
-        assert abs(lowest) < 0.004
 
 
 def test_every_planning_image_has_moved_an_object(library):

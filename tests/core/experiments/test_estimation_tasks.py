@@ -5,17 +5,6 @@ import pytest
 
 import osfcore.experiments.estimation_tasks as module
 from osfcore.errors import NoRoom
-from osfcore.experiments.estimation_tasks import (
-    FIRST_SCENE,
-    KINDS,
-    WARM_SCENE,
-    bad_case,
-    episode,
-    first_frame,
-    goals,
-    take_frame,
-    warm_models,
-)
 from osfcore.experiments.harness import MAX_TASKS
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
@@ -34,7 +23,7 @@ def draw():
 
 @pytest.fixture(scope="module")
 def start(draw, library):
-    return first_frame(draw, library, CAMERAS)
+    return module.first_frame(draw, library, CAMERAS)
 
 
 def test_a_first_frame_is_the_draw_at_rest(draw, start, library):
@@ -43,13 +32,13 @@ def test_a_first_frame_is_the_draw_at_rest(draw, start, library):
     assert start.observation.masks.shape == (2, 2, 32, 32)
     np.testing.assert_array_equal(start.observation.pusher, start.truth.pusher)
     assert start.absent == ("", "")
-    again = first_frame(draw, library, CAMERAS)
+    again = module.first_frame(draw, library, CAMERAS)
     np.testing.assert_array_equal(again.truth.poses.position, start.truth.poses.position)
     np.testing.assert_array_equal(again.observation.images, start.observation.images)
 
 
 def test_pushes_are_drawn_again_until_something_moves_by_five_centimetres(draw, library, start):
-    pushes, again = (episode(draw, library, CAMERAS[:1], steps=6) for _ in range(2))
+    pushes, again = (module.episode(draw, library, CAMERAS[:1], steps=6) for _ in range(2))
     assert pushes.redrawn > 0
     assert max(pushes.moved_m) >= 0.05
     assert len(pushes.frames) == 6
@@ -65,7 +54,7 @@ def test_pushes_are_drawn_again_until_something_moves_by_five_centimetres(draw, 
 
 
 def test_goals_move_one_object_more_each_time(draw, library, start):
-    found = goals(draw, library, goal_camera(32))
+    found = module.goals(draw, library, goal_camera(32))
     assert [len(goal.moved) for goal in found] == [1, 2]
     for goal in found:
         frame = goal.frame
@@ -94,7 +83,7 @@ def test_objects_may_fall_off_or_be_out_of_view(draw, library):
             position = state.poses.position.copy()
             position[0] = place
             world.restore(replace(state, poses=Pose(position, state.poses.quaternion)))
-            assert take_frame(world, cameras, masks=False).absent[0] == expected
+            assert module.take_frame(world, cameras, masks=False).absent[0] == expected
 
 
 def test_where_objects_do_not_fit_another_layout_is_tried(draw, library, monkeypatch):
@@ -120,11 +109,11 @@ def test_where_objects_do_not_fit_another_layout_is_tried(draw, library, monkeyp
 def cases(library):
     """One of each kind, with the frame that it was made of."""
     found = {}
-    for number, kind in enumerate(KINDS):
-        case = bad_case(SOLIDS, 2, 4, number, library, 48)
-        draw = draw_scene(SOLIDS, 2, 4, FIRST_SCENE + number)
+    for number, kind in enumerate(module.KINDS):
+        case = module.bad_case(SOLIDS, 2, 4, number, library, 48)
+        draw = draw_scene(SOLIDS, 2, 4, module.FIRST_SCENE + number)
         assert case.kind == kind
-        found[kind] = case, first_frame(draw, library, default_cameras(48))
+        found[kind] = case, module.first_frame(draw, library, default_cameras(48))
     return found
 
 
@@ -179,9 +168,9 @@ def test_goals_show_other_objects_or_come_from_another_camera(cases):
 
 @pytest.mark.slow
 def test_the_same_number_is_the_same_case(cases, library):
-    again = bad_case(SOLIDS, 2, 4, 5, library, 48)
-    np.testing.assert_array_equal(again.observation.images, cases[KINDS[5]][0].observation.images)
-    later = bad_case(SOLIDS, 2, 4, 5 + len(KINDS), library, 48)
+    again = module.bad_case(SOLIDS, 2, 4, 5, library, 48)
+    np.testing.assert_array_equal(again.observation.images, cases[module.KINDS[5]][0].observation.images)
+    later = module.bad_case(SOLIDS, 2, 4, 5 + len(module.KINDS), library, 48)
     assert later.kind == again.kind
     assert (later.observation.images != again.observation.images).any()
 
@@ -192,9 +181,9 @@ def test_the_same_number_is_the_same_case(cases, library):
 def test_every_kind_of_estimate_is_made_once_but_goals_only_where_they_are_measured(solids, library, monkeypatch):
     oracle = Oracle()
     oracle.install(monkeypatch, module)
-    draw = draw_scene(SOLIDS[:1], 1, 0, WARM_SCENE)
-    warm_models(SOLIDS[:1], solids, library, draw, 32, goal=False)
-    models = warm_models(SOLIDS[:2], solids, library, draw, 32)
+    draw = draw_scene(SOLIDS[:1], 1, 0, module.WARM_SCENE)
+    module.warm_models(SOLIDS[:1], solids, library, draw, 32, goal=False)
+    models = module.warm_models(SOLIDS[:2], solids, library, draw, 32)
     assert [what for what, _ in oracle.asked] == [*["first search 4", "next"] * 2, "goal"]
     assert models.together.names == SOLIDS[:2]
-    assert WARM_SCENE > MAX_TASKS  # nothing is measured on it
+    assert module.WARM_SCENE > MAX_TASKS  # nothing is measured on it

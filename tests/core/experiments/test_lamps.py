@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.experiments.lamps import EvaluateLamps, LampScore, evaluate_lamps, lamp_report, lamp_scene, random_spot
+from osfcore.experiments.lamps import EvaluateLamps, LampScore, evaluate_lamps, lamp_report, lamp_scene
 from osfcore.fields.field_library import FieldLibrary
 
 SCORE = LampScore(0, True, False, 2.0, 1.0, 1.0, 1.1, False, 3, 2, 0.5)
@@ -21,14 +21,6 @@ def test_figures_of_known_and_unknown_lamps():
     assert report["lamp_within_5deg"] == 0.5
     assert report["lamp_within_15percent"] == 1
     assert report["poses_15mm_10deg"] == pytest.approx(2 / 3)
-
-
-def test_lamps_are_drawn_where_they_are_asked_for():
-    spots = [random_spot(np.random.default_rng(seed)) for seed in range(50)]
-    assert all(0.4 <= spot.distance <= 1.5 for spot in spots)
-    elevations = [np.rad2deg(np.arcsin(spot.direction[2])) for spot in spots]
-    assert 19.9 < min(elevations) < max(elevations) < 80.1
-    assert all(np.abs(spot.aim).max() <= 0.05 for spot in spots)
 
 
 def test_the_same_seed_draws_the_same_photographs(library):

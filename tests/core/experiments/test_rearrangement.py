@@ -10,16 +10,6 @@ from osfcore.control.estimators import load_scene_models
 from osfcore.control.events import EpisodeSettings, Finished
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
 from osfcore.experiments.harness import TaskResult
-from osfcore.experiments.rearrangement import (
-    CURVE_MM,
-    REPORT_FILE,
-    Course,
-    EvaluateMpc,
-    MpcReport,
-    evaluate_mpc,
-    prediction_errors,
-    write_pictures,
-)
 from osfcore.experiments.rearrangement_runs import METHODS, Ended, Variant
 from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, write_fitvid
 from osfcore.fields.field_library import FieldLibrary
@@ -41,8 +31,8 @@ FEW = PlanSettings(samples=8, horizon=4)
 QUICK = EpisodeSettings(plan=FEW)
 
 
-def config(folder, **changes) -> EvaluateMpc:
-    given = EvaluateMpc(
+def config(folder, **changes) -> measured.EvaluateMpc:
+    given = measured.EvaluateMpc(
         folder / "out", folder / "data", tasks=1, objects=1, actions=2, names=(NAME,), settings=QUICK, oracle_plan=FEW,
         oracle_tries=2,
     )  # fmt: skip
@@ -55,18 +45,18 @@ def last(steps):
 
 
 def report_of(asked, library, executor=None):
-    return last(evaluate_mpc(asked, FieldLibrary(None), library, executor)).report
+    return last(measured.evaluate_mpc(asked, FieldLibrary(None), library, executor)).report
 
 
 @pytest.mark.slow
 def test_a_real_task_is_measured_once_and_reported(library, tmp_path):
     asked = config(tmp_path)
-    steps = list(evaluate_mpc(asked, FieldLibrary(None), library))
+    steps = list(measured.evaluate_mpc(asked, FieldLibrary(None), library))
     assert [(step.done, step.total, step.report is None) for step in steps] == [
         (0, 2, True), (1, 2, True), (2, 2, False)
     ]  # fmt: skip
     report = steps[-1].report
-    assert json.loads((asked.folder / REPORT_FILE).read_text()) == report
+    assert json.loads((asked.folder / measured.REPORT_FILE).read_text()) == report
     assert report["start_mm_mean"] > 70
     assert report["noaction_success_2cm"] == 0
     assert report["goal_mm_median"] < 20  # the only object is found in the goal image
@@ -195,7 +185,7 @@ def test_visual_foresight_pushes_until_all_actions_are_done(library, tmp_path, r
 )
 def test_a_mistake_is_found_before_anything_is_written(library, tmp_path, changes, error, subject):
     with pytest.raises(error, check=about(subject)):
-        next(evaluate_mpc(config(tmp_path, **changes), FieldLibrary(None), library))
+        next(measured.evaluate_mpc(config(tmp_path, **changes), FieldLibrary(None), library))
     assert not list(tmp_path.iterdir())
 
 
@@ -217,7 +207,7 @@ def pushed(library, models, count=6):
     world.arrange(2)
     box = world.truth().pose(BOX)
     world.load(replace(world.truth(), pusher=box.position * [1, 1, 0] + [0, -0.09, 0.062]))
-    course = Course()
+    course = measured.Course()
     for number in range(count + 1):
         if number:
             world.act(PUSH)
@@ -229,24 +219,24 @@ def pushed(library, models, count=6):
 
 def test_a_straight_push_of_a_box_is_predicted_within_a_centimetre(library, models):
     course = pushed(library, models)
-    found = prediction_errors(course, models)
+    found = measured.prediction_errors(course, models)
     assert len(found["mm"]) == len(found["deg"]) >= 2  # of three starts
     assert max(found["mm"]) < 10
     for number, state in course.true.items():  # what did not move does not count
         course.true[number] = replace(state, poses=course.true[0].poses)
-    assert prediction_errors(course, models) == {"mm": [], "deg": []}
+    assert measured.prediction_errors(course, models) == {"mm": [], "deg": []}
 
 
 def test_an_estimate_that_is_off_shows_in_the_error(library, models):
     course = pushed(library, models, count=4)
-    exact = prediction_errors(course, models)["mm"]
+    exact = measured.prediction_errors(course, models)["mm"]
     first = course.estimated[0]
     shift = np.array([0.3, 0, 0])  # out of the pusher's way
     course.estimated = {0: replace(first, poses=Pose(first.poses.position + shift, first.poses.quaternion))}
-    off = prediction_errors(course, models)["mm"]
+    off = measured.prediction_errors(course, models)["mm"]
     assert off[0] > 290 > exact[0]
     del course.actions[2]  # a start counts if four actions follow
-    assert prediction_errors(course, models) == {"mm": [], "deg": []}
+    assert measured.prediction_errors(course, models) == {"mm": [], "deg": []}
 
 
 # Report
@@ -287,7 +277,7 @@ ORACLE = (
 
 
 def test_figures_are_means_and_medians_over_tasks():
-    found = MpcReport(OURS, ORACLE).to_json()
+    found = measured.MpcReport(OURS, ORACLE).to_json()
     assert found == json.loads(json.dumps(found, allow_nan=False))
     assert found["tasks"] == 4
     assert found["success_2cm"] == 0.5  # one is too far away, one pushed something else
@@ -309,44 +299,34 @@ def test_figures_are_means_and_medians_over_tasks():
 
 
 def test_methods_are_compared_task_by_task_and_without_an_oracle_it_has_no_figures():
-    found, without = (MpcReport(OURS, oracle).to_json() for oracle in (ORACLE, ()))
+    found, without = (measured.MpcReport(OURS, oracle).to_json() for oracle in (ORACLE, ()))
     assert set(found) == set(without)
     assert {without[key] for key in found if key.startswith("oracle_") or key == "against_oracle"} == {None}
     against = found["against_noaction"]["success_2cm"]
     assert (against["difference"], against["p"]) == (0.5, 0.5)  # two tasks of two that differ
     assert found["against_noaction"]["pose6d"]["difference"] == pytest.approx(0.0175 - 0.1)
     assert found["against_oracle"]["success_2cm"]["difference"] == pytest.approx(-0.25)
-
-
-def test_objects_that_had_to_move_have_rows_of_their_own():
-    rows = MpcReport(OURS, ()).to_json()["by_object"]
+    rows = found["by_object"]
     assert {name: row["moved"] for name, row in rows.items()} == dict(zip(NAMES, (4, 2, 1), strict=True))
     assert rows[NAMES[0]]["within_2cm"] == 0.75
     assert rows[NAMES[0]]["tight"] == 0.5
     assert rows[NAMES[0]]["mm_median"] == 12.5
-
-
-def test_a_refused_goal_is_a_failure_and_the_overruled_figure_stands_beside_it():
-    found = MpcReport((ended(), ended(goal_doubt="009_gelatin_box: hidden")), ()).to_json()
-    assert (found["success_tight"], found["success_tight_overruled"], found["refused"]) == (0.5, 1.0, 1)
-    assert found["final_mm_mean"] == 52.5
-    assert found["seconds_robot_median"] == 6.0
-
-
-def test_more_succeed_the_farther_off_they_may_be():
-    found = MpcReport(OURS, ()).to_json()
-    curve = [found["success_curve"][str(mm)] for mm in CURVE_MM]
+    curve = [found["success_curve"][str(mm)] for mm in measured.CURVE_MM]
     assert curve == sorted(curve)
     assert found["success_curve"]["20"] == found["success_2cm"]
     assert curve[-1] == 0.75  # what was pushed away stays so
 
 
-def test_what_never_happened_has_no_median():
+def test_a_refused_goal_is_a_failure_and_what_never_happened_has_no_median():
+    found = measured.MpcReport((ended(), ended(goal_doubt="009_gelatin_box: hidden")), ()).to_json()
+    assert (found["success_tight"], found["success_tight_overruled"], found["refused"]) == (0.5, 1.0, 1)
+    assert found["final_mm_mean"] == 52.5
+    assert found["seconds_robot_median"] == 6.0
     rejected = {"no room": 1, "not at rest": 4}
     refused = ended(plan_s=None, estimate_s=None, goal_doubt="009_gelatin_box: hidden", rejected=rejected)
-    found = MpcReport((refused,), ()).to_json()
+    found = measured.MpcReport((refused,), ()).to_json()
     assert found["replan_s_median"] is found["estimate_s_median"] is found["seconds_robot_median"] is None
-    found = MpcReport((refused, ended(plan_s=3.0, rejected={"no room": 2})), ()).to_json()
+    found = measured.MpcReport((refused, ended(plan_s=3.0, rejected={"no room": 2})), ()).to_json()
     assert found["replan_s_median"] == 3.0
     assert found["rejected_layouts"] == {"no room": 3, "not at rest": 4}
 
@@ -354,7 +334,7 @@ def test_what_never_happened_has_no_median():
 def test_pictures_show_tasks_and_the_oracle_has_its_own_curve(tmp_path):
     charts = []
     for name, oracle in (("with", ORACLE), ("without", ())):
-        write_pictures(tmp_path / name, MpcReport(OURS, oracle))
+        measured.write_pictures(tmp_path / name, measured.MpcReport(OURS, oracle))
         charts.append((tmp_path / name / "mpc.png").read_bytes())
         sheet = cv2.imread(str(tmp_path / name / "mpc_tasks.png"))
         assert {40, 200} <= set(np.unique(sheet))  # goals and what was reached

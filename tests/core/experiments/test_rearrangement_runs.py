@@ -7,18 +7,7 @@ import pytest
 from osfcore.control.estimators import Estimators, load_scene_models
 from osfcore.control.events import ActionExecuted, EpisodeSettings, GoalFound, Stepped
 from osfcore.errors import InvalidInput
-from osfcore.experiments.rearrangement_runs import (
-    METHODS,
-    TRUTHS,
-    LoopParts,
-    SimulatedModel,
-    TrueState,
-    Variant,
-    check_variant,
-    loop_parts,
-    run_from_images,
-    run_told_the_truth,
-)
+from osfcore.experiments import rearrangement_runs as runs
 from osfcore.experiments.rivals.nerf import UnlitRenderer
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import goal_camera
@@ -62,9 +51,9 @@ def pictures(world, state, cameras):
 
 def test_the_loop_goes_from_the_start_toward_the_goal(task, library, models, world):
     """With every truth in the place of estimates, which take half a minute."""
-    variant = Variant(truths=frozenset(TRUTHS), views=1)
-    parts = LoopParts(models, Estimators())
-    events = list(run_from_images(task, library, parts, QUICK, np.random.default_rng(0), variant=variant))
+    variant = runs.Variant(truths=frozenset(runs.TRUTHS), views=1)
+    parts = runs.LoopParts(models, Estimators())
+    events = list(runs.run_from_images(task, library, parts, QUICK, np.random.default_rng(0), variant=variant))
     first, *_, finished, ended = events
     cameras = first.observation.cameras
     assert len(cameras) == 1
@@ -76,29 +65,18 @@ def test_the_loop_goes_from_the_start_toward_the_goal(task, library, models, wor
     assert finished.number == sum(isinstance(event, ActionExecuted) for event in events) == 2
     for before, event in pairwise(events):
         if isinstance(event, Stepped):
-            assert isinstance(before, TrueState)
+            assert isinstance(before, runs.TrueState)
             np.testing.assert_array_equal(event.estimate.state.poses.position, before.state.poses.position)
     np.testing.assert_allclose(ended.goal, pictures(world, task.goal, (goal_camera(),))[0], atol=1e-6)
     bare = replace(ended.state, pusher=None)
     np.testing.assert_allclose(ended.image, pictures(world, bare, (goal_camera(),))[0], atol=1e-6)
 
 
-def test_the_simulator_predicts_what_then_happens(task, library, world):
-    model = SimulatedModel(library, task.start.names)
-    action = np.array([0.2, 0.1, 0.0])
-    world.restore(task.start)
-    predicted = model.rollout(world.truth(), action[None, None])
-    model.close()
-    world.act(action)
-    np.testing.assert_allclose(predicted.positions[0, 1], world.truth().poses.position, atol=2e-3)
-    np.testing.assert_allclose(predicted.pusher[0, 1], world.truth().pusher, atol=1e-6)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("knows_pushes", [True, False])
 def test_with_true_poses_it_comes_nearer(task, library, models, world, knows_pushes):
-    settings = EpisodeSettings(steps=12, replan_every=2, plan=PlanSettings(samples=16))
-    ended = run_told_the_truth(task, library, models, settings, np.random.default_rng(0), knows_pushes=knows_pushes)
+    settings, rng = EpisodeSettings(steps=12, replan_every=2, plan=PlanSettings(samples=16)), np.random.default_rng(0)
+    ended = runs.run_told_the_truth(task, library, models, settings, rng, knows_pushes=knows_pushes)
     before, after = (score_of(task, state, models.symmetries).moved_mm for state in (task.start, ended.state))
     assert before > 70
     assert after < before / 2
@@ -108,7 +86,7 @@ def test_with_true_poses_it_comes_nearer(task, library, models, world, knows_pus
 
 def test_what_is_at_its_goal_is_left_alone(task, library, models):
     done = replace(task, goal=replace(task.start, pusher=None))
-    ended = run_told_the_truth(done, library, models, QUICK, np.random.default_rng(0), knows_pushes=True)
+    ended = runs.run_told_the_truth(done, library, models, QUICK, np.random.default_rng(0), knows_pushes=True)
     assert score_of(done, ended.state, models.symmetries).moved_mm == pytest.approx(0, abs=0.01)
     np.testing.assert_allclose(ended.image, ended.goal, atol=1e-3)
 
@@ -119,48 +97,48 @@ def test_what_is_at_its_goal_is_left_alone(task, library, models):
 @pytest.mark.parametrize(
     ("variant", "subject"),
     [
-        (Variant("magic"), "method"),
-        (Variant("ours", frozenset({"fields"})), "stages of ours"),
-        (Variant("paper", frozenset({"hands"})), "stages of ours"),
-        (Variant("paper", frozenset(STAGES)), "stages of ours"),
-        (Variant("paper", truths=frozenset({"goal"})), "truth"),
-        (Variant("ours", truths=frozenset({"luck"})), "truth"),
-        (Variant(views=0), "views"),
-        (Variant(views=5), "views"),
-        (Variant(has_masks=True), "masks"),
-        (Variant("paper", frozenset({"planning"}), has_masks=True), "masks"),
-        (Variant("foresight", views=2), "views"),
+        (runs.Variant("magic"), "method"),
+        (runs.Variant("ours", frozenset({"fields"})), "stages of ours"),
+        (runs.Variant("paper", frozenset({"hands"})), "stages of ours"),
+        (runs.Variant("paper", frozenset(STAGES)), "stages of ours"),
+        (runs.Variant("paper", truths=frozenset({"goal"})), "truth"),
+        (runs.Variant("ours", truths=frozenset({"luck"})), "truth"),
+        (runs.Variant(views=0), "views"),
+        (runs.Variant(views=5), "views"),
+        (runs.Variant(has_masks=True), "masks"),
+        (runs.Variant("paper", frozenset({"planning"}), has_masks=True), "masks"),
+        (runs.Variant("foresight", views=2), "views"),
     ],
 )
 def test_what_cannot_be_combined_is_refused(variant, subject):
     with pytest.raises(InvalidInput, check=about(subject)):
-        check_variant(variant)
+        runs.check_variant(variant)
 
 
 def test_variants_that_differ_have_names_that_differ():
-    variants = [Variant(method) for method in METHODS]
-    variants += [Variant("paper", frozenset({stage})) for stage in STAGES]
-    variants += [Variant(truths=frozenset({truth})) for truth in TRUTHS]
-    variants += [Variant(views=views) for views in (1, 2, 3)]
-    variants.append(Variant("paper", has_masks=True))
+    variants = [runs.Variant(method) for method in runs.METHODS]
+    variants += [runs.Variant("paper", frozenset({stage})) for stage in STAGES]
+    variants += [runs.Variant(truths=frozenset({truth})) for truth in runs.TRUTHS]
+    variants += [runs.Variant(views=views) for views in (1, 2, 3)]
+    variants.append(runs.Variant("paper", has_masks=True))
     for variant in variants:
-        check_variant(variant)
+        runs.check_variant(variant)
     assert len({variant.name() for variant in variants}) == len(variants)
 
 
 def test_a_loop_is_made_of_what_its_method_has(task, models):
     def made(variant):
         lights = task.start.light, task.goal.light
-        return loop_parts(variant, models, FieldLibrary(None), None, lights)
+        return runs.loop_parts(variant, models, FieldLibrary(None), None, lights)
 
-    assert made(Variant()).models is models
-    assert made(Variant("known_light")).estimators.first.held_light == tuple(task.start.light.direction)
-    assert made(Variant("overhead")).estimators.goal.held_light == (0, 0, 1)
-    assert isinstance(made(Variant("nerf")).models.appearance.together, UnlitRenderer)
-    published = made(Variant("paper", frozenset({"estimation", "dynamics", "planning"})))
+    assert made(runs.Variant()).models is models
+    assert made(runs.Variant("known_light")).estimators.first.held_light == tuple(task.start.light.direction)
+    assert made(runs.Variant("overhead")).estimators.goal.held_light == (0, 0, 1)
+    assert isinstance(made(runs.Variant("nerf")).models.appearance.together, UnlitRenderer)
+    published = made(runs.Variant("paper", frozenset({"estimation", "dynamics", "planning"})))
     assert isinstance(published.models.appearance.together, PaperRenderer)
     assert published.models.dynamics is models.dynamics
     assert not isinstance(published.estimators, PaperEstimators)
-    looked = made(Variant("paper", frozenset({"fields", "dynamics", "planning"})))
+    looked = made(runs.Variant("paper", frozenset({"fields", "dynamics", "planning"})))
     assert isinstance(looked.models.appearance.together, SceneRenderer)
     assert isinstance(looked.estimators, PaperEstimators)

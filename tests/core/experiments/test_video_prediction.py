@@ -1,5 +1,4 @@
 import json
-from contextlib import contextmanager
 from dataclasses import replace
 
 import cv2
@@ -8,22 +7,12 @@ import pytest
 
 import osfcore.experiments.estimation_tasks as tasks
 import osfcore.experiments.video_prediction as videos
-from osfcore.control.estimators import Estimators, load_scene_models
+from osfcore.control.estimators import load_scene_models
 from osfcore.errors import InvalidInput
 from osfcore.experiments.rearrangement_runs import TrueEstimators
 from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, read_fitvid, write_fitvid
-from osfcore.experiments.video_prediction import (
-    CHART_FILE,
-    IMAGES_FILE,
-    REPORT_FILE,
-    CompareVideos,
-    compare_videos,
-    measure_video,
-    predict_through_fields,
-    simulate_video,
-)
 from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.metrics.image_errors import psnr
 from osfcore.random_streams import Stream
 from osfcore.world.tasks import draw_scene
@@ -35,13 +24,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 # Comparisons
 
 
-def config(folder, **changes) -> CompareVideos:
-    given = CompareVideos(folder / "out", folder / "data", SOLIDS, tasks=1, objects=2, steps=12, size=16)
+def config(folder, **changes) -> videos.CompareVideos:
+    given = videos.CompareVideos(folder / "out", folder / "data", SOLIDS, tasks=1, objects=2, steps=12, size=16)
     return replace(given, **changes)
 
 
 def report_of(asked, library):
-    *_, last = compare_videos(asked, FieldLibrary(None), library)
+    *_, last = videos.compare_videos(asked, FieldLibrary(None), library)
     return last.report
 
 
@@ -59,7 +48,7 @@ def compared(library, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tasks, "PUSHED_M", 0.0)
         patch.setattr(videos, "predict_through_fields", lambda video, *_: np.full_like(video.frames, 0.5))
-        yield asked, list(compare_videos(asked, FieldLibrary(None), library))
+        yield asked, list(videos.compare_videos(asked, FieldLibrary(None), library))
 
 
 @pytest.mark.slow
@@ -67,7 +56,7 @@ def test_an_episode_is_predicted_by_all_methods(compared):
     asked, steps = compared
     assert [(step.done, step.total) for step in steps] == [(n, 5) for n in range(6)]
     report = steps[-1].report
-    assert json.loads((asked.folder / REPORT_FILE).read_text()) == report
+    assert json.loads((asked.folder / videos.REPORT_FILE).read_text()) == report
     assert list(report["methods"]) == ["copied", "ours", "paper", "nerf", "fitvid"]
     for figures in report["methods"].values():
         for row in figures.values():
@@ -77,10 +66,10 @@ def test_an_episode_is_predicted_by_all_methods(compared):
     assert report["methods"]["ours"] == report["methods"]["paper"] == report["methods"]["nerf"]
     ours, copied = (report["methods"][who]["mse"]["spans"]["12"]["mean"] for who in ("ours", "copied"))
     assert report["against"]["copied"]["mse"]["12"]["difference"] == pytest.approx(ours - copied, abs=1e-6)
-    image = cv2.imread(str(asked.folder / IMAGES_FILE))
+    image = cv2.imread(str(asked.folder / videos.IMAGES_FILE))
     assert image.shape[0] > 6 * 16  # simulator and methods
     assert image.shape[1] > 2 * 16  # steps 1 and 10
-    assert (asked.folder / CHART_FILE).exists()
+    assert (asked.folder / videos.CHART_FILE).exists()
 
 
 @pytest.mark.slow
@@ -99,12 +88,10 @@ def test_what_was_predicted_is_taken_over_method_by_method(compared, library, mo
 @pytest.mark.parametrize(
     ("changes", "subject"),
     [
-        ({"tasks": 0}, "tasks"),
         ({"objects": 4}, "number of objects"),
         ({"steps": 500}, "steps"),
-        ({"seed": -1}, "seed"),
         ({"methods": ()}, "methods"),
-        ({"size": 32}, "image size"),
+        ({"size": 32}, "size"),
     ],
 )
 def test_a_mistake_is_found_before_anything_is_written(library, tmp_path, changes, subject):
@@ -125,46 +112,35 @@ DRAW = draw_scene(SOLIDS, 2, 3, 0, Stream.VIDEO_SCENE)
 def video(library):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tasks, "PUSHED_M", 0.0)  # few steps push nothing far
-        yield simulate_video(DRAW, library, STEPS, SIZE)
+        yield videos.simulate_video(DRAW, library, STEPS, SIZE)
 
 
 @pytest.fixture
 def measure(library, tmp_path):
     """Measures an episode as a method predicts it."""
 
-    def measure(method, number=0, size=SIZE):
-        asked = CompareVideos(tmp_path, tmp_path, steps=STEPS, size=size)
-        return measure_video(asked, FieldLibrary(None), library, number, DRAW, method)
+    def measure(method, size=SIZE):
+        asked = videos.CompareVideos(tmp_path, tmp_path, steps=STEPS, size=size)
+        return videos.measure_video(asked, FieldLibrary(None), library, 0, DRAW, method)
 
     return measure
-
-
-@contextmanager
-def at_rest(library):
-    with tasks.opened(DRAW, library) as world:
-        world.restore(world.truth())
-        yield world
 
 
 def test_the_actions_lead_from_each_frame_to_the_next(video, library):
     camera = (goal_camera(SIZE),)
     assert video.frames.shape == (STEPS, SIZE, SIZE, 3)
-    with at_rest(library) as world:
+    with tasks.opened(DRAW, library) as world:
+        world.restore(world.truth())
         seen = [world.render(camera).images[0]]
         for action in (video.between, *video.actions):
             world.act(action)
             seen.append(world.render(camera).images[0])
+            if len(seen) == 2:  # the look has four views with masks at the last known frame
+                look = world.render(default_cameras(), masks=True)
     np.testing.assert_allclose(np.concatenate([video.context, video.frames]), seen, atol=1e-4)
-
-
-def test_the_look_has_four_views_with_masks_at_the_last_known_frame(video, library):
-    assert [camera.name for camera in video.look.cameras] == ["0", "1", "2", "3"]
-    with at_rest(library) as world:
-        world.act(video.between)
-        observation = world.render(video.look.cameras, masks=True)
-    np.testing.assert_allclose(video.look.images, observation.images, atol=1e-4)
-    np.testing.assert_array_equal(video.look.masks, observation.masks)
-    np.testing.assert_array_equal(video.look.pusher, observation.pusher)
+    np.testing.assert_allclose(video.look.images, look.images, atol=1e-4)
+    np.testing.assert_array_equal(video.look.masks, look.masks)
+    np.testing.assert_array_equal(video.look.pusher, look.pusher)
 
 
 def test_figures_are_of_each_step(video, measure, monkeypatch):
@@ -180,11 +156,12 @@ def test_figures_are_of_each_step(video, measure, monkeypatch):
 
 def test_with_the_true_state_our_prediction_is_better_than_a_copy(video, library):
     models = load_scene_models(video.look.names, FieldLibrary(None), library, None)
-    with at_rest(library) as world:
+    with tasks.opened(DRAW, library) as world:
+        world.restore(world.truth())
         world.act(video.between)
         start = world.truth()
     exact = TrueEstimators(truth=lambda: start)
-    predicted = predict_through_fields(video, models, exact, goal_camera(SIZE), np.random.default_rng(0))
+    predicted = videos.predict_through_fields(video, models, exact, goal_camera(SIZE), np.random.default_rng(0))
     assert predicted.shape == video.frames.shape
     ours = [psnr(true, image) for true, image in zip(video.frames, predicted, strict=True)]
     copied = [psnr(true, video.context[1]) for true in video.frames]
@@ -201,22 +178,3 @@ def test_fitvid_sees_two_frames_and_the_actions(video, measure, monkeypatch, tmp
     expected = network.predict(context, video.actions[None], between=video.between)[0]
     found = measure("fitvid", size=64).figures["psnr"]
     assert found == pytest.approx([psnr(true, image) for true, image in zip(frames, expected, strict=True)])
-
-
-def test_all_methods_estimate_with_the_same_random_numbers(video, measure, monkeypatch):
-    monkeypatch.setattr(videos, "simulate_video", lambda *_: video)
-    drawn = []
-
-    def predict(_video, models, estimators, camera, rng):
-        drawn.append((type(models.dynamics), type(estimators), camera.width, rng.random()))
-        return video.frames
-
-    monkeypatch.setattr(videos, "predict_through_fields", predict)
-    for method, number in (("ours", 4), ("paper", 4), ("ours", 5)):
-        assert measure(method, number).figures["psnr"] == [100] * STEPS
-    ours, theirs, other = drawn
-    assert ours[1] is Estimators
-    assert theirs[1] is not Estimators
-    assert ours[0] != theirs[0]
-    assert ours[2:] == theirs[2:]
-    assert other[3] != ours[3]

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from osfcore.control.events import EpisodeSettings
-from osfcore.errors import InvalidInput
 from osfcore.experiments.factors import EPISODE_FACTORS
 from osfcore.experiments.rearrangement import EvaluateMpc
 from osfcore.experiments.rearrangement_runs import Variant, check_variant
@@ -25,7 +24,6 @@ from osfcore.experiments.reproduction.reproduction import (
 from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, write_fitvid
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.planning.mppi import PlanSettings
-from tests.support.errors import about
 
 NAME = "005_tomato_soup_can"
 SMALLEST = replace(
@@ -92,16 +90,6 @@ def test_episodes_that_several_sections_show_are_run_once(library, tmp_path, run
 
 
 @pytest.mark.slow
-def test_another_plan_takes_over_no_episode(library, tmp_path, runs):
-    longer = replace(SMALLEST, settings=EpisodeSettings(steps=2, plan=PlanSettings(samples=9)))
-    counts = []
-    for scale in (SMALLEST, longer, SMALLEST):
-        reproduced(library, config(tmp_path, parts=("attribution",), scale=scale))
-        counts.append(len(runs))
-    assert counts[1] == counts[2] == 2 * counts[0]
-
-
-@pytest.mark.slow
 def test_images_are_compared_as_well(library, tmp_path):
     few = replace(SMALLEST, scenes=1, videos=1)
     asked = config(tmp_path, parts=("relighting", "video"), scale=few)
@@ -114,18 +102,6 @@ def test_images_are_compared_as_well(library, tmp_path):
     gap = report["relighting"]["against"]["nerf"]["psnr"]["all"]["difference"]
     assert gap > 3
     assert f">{gap:.3g}<" in page  # of one scene there is no interval
-
-
-@pytest.mark.parametrize(
-    ("changes", "subject"),
-    [
-        ({"parts": ("luck",)}, "part"),
-        ({"scale": replace(SMALLEST, tasks=0, headline=0), "parts": ("methods",)}, "tasks"),
-    ],
-)
-def test_a_mistake_is_found(library, tmp_path, changes, subject):
-    with pytest.raises(InvalidInput, check=about(subject)):
-        reproduced(library, config(tmp_path, **changes))
 
 
 # Sections

@@ -8,17 +8,7 @@ from hypothesis import strategies as st
 from safetensors.torch import load, save
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.experiments.rivals.fitvid import (
-    FORMAT,
-    DecoderCell,
-    EncoderCell,
-    FitVidModel,
-    FitVidSettings,
-    Gaussian,
-    kl_divergence,
-    read_fitvid,
-    write_fitvid,
-)
+from osfcore.experiments.rivals import fitvid
 from osfcore.experiments.rivals.train_fitvid import as_frames
 from tests.support.errors import about
 from tests.support.push_videos import square_video
@@ -28,13 +18,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 # Model
 
 
-TINY = FitVidSettings(side=16, width=2, features=12, hidden=16, latent=3)
+TINY = fitvid.FitVidSettings(side=16, width=2, features=12, hidden=16, latent=3)
 
 
-def model(settings=TINY, seed=0, **more) -> FitVidModel:
+def model(settings=TINY, seed=0, **more) -> fitvid.FitVidModel:
     """A network as it begins, but for its last layer, whose zeros would hide what is before it."""
     torch.manual_seed(seed)
-    network = FitVidModel(settings, **more)
+    network = fitvid.FitVidModel(settings, **more)
     with torch.no_grad():
         network.decoder.colours.weight.normal_(std=0.1)
     return network
@@ -50,7 +40,9 @@ def scene(side=16, steps=4, seed=0):
 def test_with_the_originals_channels_it_has_302_million_parameters():
     """With its 64 channels at 64 pixels; the variance that is never used is not counted."""
     with torch.device("meta"):
-        assert FitVidModel(FitVidSettings(side=64, width=64)).parameter_count == pytest.approx(302e6, rel=0.03)
+        assert fitvid.FitVidModel(fitvid.FitVidSettings(side=64, width=64)).parameter_count == pytest.approx(
+            302e6, rel=0.03
+        )
 
 
 @pytest.mark.parametrize(
@@ -59,19 +51,19 @@ def test_with_the_originals_channels_it_has_302_million_parameters():
 )
 def test_sizes_out_of_range_are_refused(bad, subject):
     with pytest.raises(InvalidInput, check=about(subject)):
-        FitVidSettings(**bad)
+        fitvid.FitVidSettings(**bad)
 
 
 def test_a_decoder_cell_begins_as_its_shortcut():
     x = torch.randn(2, 4, 8, 8)
-    torch.testing.assert_close(DecoderCell(4, 4)(x), torch.nn.functional.silu(x))
-    assert DecoderCell(4, 2, grows=True)(x).shape == (2, 2, 16, 16)
-    assert EncoderCell(4, 6, 2)(x).shape == (2, 6, 4, 4)
+    torch.testing.assert_close(fitvid.DecoderCell(4, 4)(x), torch.nn.functional.silu(x))
+    assert fitvid.DecoderCell(4, 2, grows=True)(x).shape == (2, 2, 16, 16)
+    assert fitvid.EncoderCell(4, 6, 2)(x).shape == (2, 6, 4, 4)
 
 
 @pytest.mark.parametrize("side", [16, 32])
 def test_predictions_are_images_and_the_same_each_time(side):
-    network = model(FitVidSettings(side=side, width=1, features=8, hidden=8, latent=2)).eval()
+    network = model(fitvid.FitVidSettings(side=side, width=1, features=8, hidden=8, latent=2)).eval()
     context = np.random.default_rng(0).random((2, side, side, 3))
     frames, again = (network.predict(context, np.zeros((5, 3, 3))) for _ in range(2))
     assert frames.shape == (5, 3, side, side, 3)
@@ -84,7 +76,7 @@ def test_predictions_are_images_and_the_same_each_time(side):
 
 def test_a_new_network_copies_the_last_frame():
     context = np.random.default_rng(0).random((2, 16, 16, 3))
-    frames = FitVidModel(TINY).eval().predict(context, np.full((2, 3, 3), 0.1))
+    frames = fitvid.FitVidModel(TINY).eval().predict(context, np.full((2, 3, 3), 0.1))
     np.testing.assert_allclose(frames, np.broadcast_to(context[1], frames.shape), atol=1 / 255)
 
 
@@ -127,7 +119,7 @@ def test_the_error_is_that_of_the_frames_and_latents_come_from_the_generator():
 
 @pytest.mark.slow
 def test_a_short_sequence_can_be_learned_better_than_by_copying():
-    network = model(FitVidSettings(side=16, width=4, features=16, hidden=32, latent=2))
+    network = model(fitvid.FitVidSettings(side=16, width=4, features=16, hidden=32, latent=2))
     videos = [scene(steps=4, seed=seed) for seed in range(2)]
     video, actions = (torch.cat(parts) for parts in zip(*videos, strict=True))
     copied = float((video[:, 2:] - video[:, 1:2]).square().mean())
@@ -145,20 +137,20 @@ def test_a_short_sequence_can_be_learned_better_than_by_copying():
 
 
 pairs = st.tuples(st.floats(-3, 3), st.floats(-3, 3)).map(torch.tensor)
-gaussians = st.builds(Gaussian, pairs, pairs)
+gaussians = st.builds(fitvid.Gaussian, pairs, pairs)
 
 
 @given(p=gaussians, q=gaussians)
 def test_the_divergence_is_what_torch_computes_and_never_negative(p, q):
     normal = [torch.distributions.Normal(g.mean, (g.logvar / 2).exp()) for g in (p, q)]
     expected = torch.distributions.kl_divergence(*normal).sum()
-    torch.testing.assert_close(kl_divergence(p, q), expected, rtol=1e-4, atol=1e-5)
-    assert float(kl_divergence(p, q)) >= -1e-5
-    assert float(kl_divergence(p, p)) == pytest.approx(0, abs=1e-6)
+    torch.testing.assert_close(fitvid.kl_divergence(p, q), expected, rtol=1e-4, atol=1e-5)
+    assert float(fitvid.kl_divergence(p, q)) >= -1e-5
+    assert float(fitvid.kl_divergence(p, p)) == pytest.approx(0, abs=1e-6)
 
 
 def test_draws_have_the_mean_and_the_variance():
-    one = Gaussian(torch.full((40_000,), 2.0), torch.full((40_000,), math.log(9.0)))
+    one = fitvid.Gaussian(torch.full((40_000,), 2.0), torch.full((40_000,), math.log(9.0)))
     drawn = one.sample(torch.Generator().manual_seed(0))
     assert float(drawn.mean()) == pytest.approx(2, abs=0.05)
     assert float(drawn.std()) == pytest.approx(3, abs=0.05)
@@ -167,8 +159,8 @@ def test_draws_have_the_mean_and_the_variance():
 # Weights
 
 
-SETTINGS = FitVidSettings(side=16, width=1, features=6, hidden=8, latent=2)
-META = {"format": FORMAT, "side": "16", "width": "1", "features": "6", "hidden": "8", "latent": "2"}
+SETTINGS = fitvid.FitVidSettings(side=16, width=1, features=6, hidden=8, latent=2)
+META = {"format": fitvid.FORMAT, "side": "16", "width": "1", "features": "6", "hidden": "8", "latent": "2"}
 
 
 @pytest.fixture
@@ -180,12 +172,12 @@ def network():
 
 @pytest.fixture
 def file(network, tmp_path):
-    write_fitvid(tmp_path / "net.safetensors", network)
+    fitvid.write_fitvid(tmp_path / "net.safetensors", network)
     return tmp_path / "net.safetensors"
 
 
 def test_what_was_written_predicts_the_same(network, file):
-    again = read_fitvid(file)
+    again = fitvid.read_fitvid(file)
     assert again.settings == SETTINGS
     assert not again.training
     for name, value in network.state_dict().items():
@@ -204,7 +196,7 @@ def damaged(file, **changes):
     ("spoil", "reason"),
     [
         (lambda f: f.read_bytes()[:1000], "no video prediction network"),
-        (lambda f: save(load(f.read_bytes()), {**META, "format": "pushes-2"}), FORMAT),
+        (lambda f: save(load(f.read_bytes()), {**META, "format": "pushes-2"}), fitvid.FORMAT),
         (lambda f: save(load(f.read_bytes()), {n: v for n, v in META.items() if n != "hidden"}), "hidden"),
         (lambda f: save(load(f.read_bytes()), {**META, "side": "17"}), "17"),
         (lambda f: save(load(f.read_bytes()), {**META, "width": "256", "hidden": "4096"}), "fit"),
@@ -216,4 +208,4 @@ def damaged(file, **changes):
 def test_damaged_files_are_refused(file, spoil, reason):
     file.write_bytes(spoil(file))
     with pytest.raises(CorruptFile, check=about(reason)):
-        read_fitvid(file)
+        fitvid.read_fitvid(file)

@@ -7,16 +7,8 @@ import torch
 from safetensors.torch import load
 
 from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.experiments.rivals import train_fitvid as training
 from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, read_fitvid
-from osfcore.experiments.rivals.train_fitvid import (
-    TrainFitVid,
-    VideoErrors,
-    VideoFiles,
-    augmented,
-    measure,
-    train_fitvid,
-    windows,
-)
 from osfcore.io.push_file import read_pushes
 from osfcore.metrics.image_errors import psnr
 from tests.support.errors import about
@@ -32,14 +24,14 @@ def data(tmp_path_factory):
     return write_videos(tmp_path_factory.mktemp("videos") / "videos.h5")
 
 
-def config(data, folder, **changes) -> TrainFitVid:
+def config(data, folder, **changes) -> training.TrainFitVid:
     settings = {"iterations": 3, "width": 1, "batch": 2, "frames": 4, "save_every": 1, "device": "cpu"}
-    return TrainFitVid((data,), folder / "net.safetensors", **{**settings, **changes})
+    return training.TrainFitVid((data,), folder / "net.safetensors", **{**settings, **changes})
 
 
 def stop(settings, done) -> None:
     """Begin a training and leave it after so many steps."""
-    begun = train_fitvid(settings)
+    begun = training.train_fitvid(settings)
     while next(begun).done < done:
         pass
     begun.close()
@@ -47,7 +39,7 @@ def stop(settings, done) -> None:
 
 def test_a_run_writes_a_network_and_its_metrics(data, tmp_path):
     settings = config(data, tmp_path)
-    steps = list(train_fitvid(settings))
+    steps = list(training.train_fitvid(settings))
     assert (steps[0].done, steps[-1].done, steps[-1].total) == (0, 3, 3)
     metrics = json.loads(settings.out.with_suffix(".json").read_text(), parse_constant=pytest.fail)
     assert (metrics["iterations"], metrics["episodes"], metrics["videos"]) == (3, 12, 2)
@@ -60,7 +52,8 @@ def test_a_run_writes_a_network_and_its_metrics(data, tmp_path):
 
 
 def test_the_command_names_what_differs_from_the_defaults(data, tmp_path):
-    changed = TrainFitVid((data,), tmp_path / "net.safetensors", minutes=5.0, save_every=7, augment=False, seed=3)
+    out = tmp_path / "net.safetensors"
+    changed = training.TrainFitVid((data,), out, minutes=5.0, save_every=7, augment=False, seed=3)
     assert changed.command == (
         "osf train fitvid --data videos.h5 --out net.safetensors --minutes 5.0 --no-augment --save-every 7 --seed 3"
     )
@@ -68,10 +61,10 @@ def test_the_command_names_what_differs_from_the_defaults(data, tmp_path):
 
 def test_an_abandoned_run_goes_on_and_ends_as_a_whole_one(data, tmp_path):
     whole, parts = (config(data, tmp_path / name, measured=1) for name in ("whole", "parts"))
-    list(train_fitvid(whole))
+    list(training.train_fitvid(whole))
     stop(replace(parts, iterations=2), 1)  # the budget may grow
     assert not parts.out.exists()
-    assert [s.done for s in train_fitvid(parts)][:3] == [1, 2, 3]
+    assert [s.done for s in training.train_fitvid(parts)][:3] == [1, 2, 3]
     a, b = (load(one.out.read_bytes()) for one in (whole, parts))
     assert all(torch.equal(a[name], b[name]) for name in a)
 
@@ -83,11 +76,11 @@ def test_a_checkpoint_that_does_not_fit_is_not_gone_on_with(data, tmp_path, dama
     checkpoint = settings.out.with_suffix(".checkpoint")
     if damage == "cut short":
         checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    assert next(iter(train_fitvid(settings))).done == 0
+    assert next(iter(training.train_fitvid(settings))).done == 0
 
 
 def test_a_time_budget_ends(data, tmp_path):
-    steps = list(train_fitvid(config(data, tmp_path, iterations=None, minutes=0.01)))
+    steps = list(training.train_fitvid(config(data, tmp_path, iterations=None, minutes=0.01)))
     assert steps[-1].done == steps[-1].total == 1
 
 
@@ -104,20 +97,17 @@ def test_a_time_budget_ends(data, tmp_path):
 )
 def test_bad_settings_are_refused_and_nothing_is_written(data, tmp_path, change, subject):
     with pytest.raises(InvalidInput, check=about(subject)):
-        list(train_fitvid(replace(config(data, tmp_path), **change)))
+        list(training.train_fitvid(replace(config(data, tmp_path), **change)))
     assert not list(tmp_path.iterdir())
 
 
 def test_bad_places_and_files_are_refused(data, tmp_path):
     good = config(data, tmp_path)
     with pytest.raises(InvalidInput):
-        list(train_fitvid(replace(good, out=tmp_path / "net.pt")))
-    (tmp_path / "file").write_text("not a push file")
-    with pytest.raises(CorruptFile, check=about("file")):
-        list(train_fitvid(replace(good, data=(tmp_path / "file",))))
+        list(training.train_fitvid(replace(good, out=tmp_path / "net.pt")))
     (tmp_path / "net.json").write_text("{}")
     with pytest.raises(InvalidInput):  # it belongs to something else
-        list(train_fitvid(good))
+        list(training.train_fitvid(good))
 
 
 # Augmentation
@@ -128,14 +118,14 @@ def test_what_does_not_change_stays_the_same_beside_what_does(seed):
     """The left half moves in time, the right one does not."""
     video = torch.rand(4, 3, 32, 32, generator=torch.Generator().manual_seed(seed))
     video[:, :, :, 16:] = video[:1, :, :, 16:]
-    (varied,) = augmented(video[None], np.random.default_rng(seed))
+    (varied,) = training.augmented(video[None], np.random.default_rng(seed))
     right = varied[..., 24:]
     torch.testing.assert_close(right, right[:1].expand_as(right))
 
 
 def test_videos_of_a_batch_are_varied_differently_and_stay_images():
     video = torch.rand(1, 3, 3, 16, 16, generator=torch.Generator().manual_seed(0)).expand(6, -1, -1, -1, -1)
-    varied, again = (augmented(video, np.random.default_rng(0)) for _ in range(2))
+    varied, again = (training.augmented(video, np.random.default_rng(0)) for _ in range(2))
     assert torch.equal(varied, again)
     assert all(not torch.equal(varied[0], other) for other in varied[1:])
     assert 0 <= float(varied.min()) <= float(varied.max()) <= 1
@@ -145,7 +135,7 @@ def test_at_most_a_fifth_of_the_side_is_cropped():
     """A ramp across the image keeps four fifths of its slope at least, whatever happens to its colours."""
     ramp = torch.linspace(0.2, 0.8, 40).expand(1, 2, 3, 40, 40)
     for seed in range(20):
-        varied = augmented(ramp, np.random.default_rng(seed))
+        varied = training.augmented(ramp, np.random.default_rng(seed))
         inner = varied[..., 5:-5]
         assert float(inner.diff(dim=-1).mean()) > 0
         torch.testing.assert_close(inner.diff(dim=-2), torch.zeros(1, 2, 3, 39, 30), atol=1e-5, rtol=0)
@@ -156,9 +146,9 @@ def test_at_most_a_fifth_of_the_side_is_cropped():
 
 def test_windows_are_stretches_of_the_episodes(data):
     episodes = read_pushes(data)
-    with VideoFiles((data, data)) as files:
+    with training.VideoFiles((data, data)) as files:
         assert (files.side, len(files.learned), len(files.held_out)) == (16, 24, 4)
-        some = windows([files.held_out[0], files.held_out[1]], np.array([1, 2]), 3)
+        some = training.windows([files.held_out[0], files.held_out[1]], np.array([1, 2]), 3)
         for n, (number, start) in enumerate(((0, 1), (12, 2))):
             np.testing.assert_array_equal(some.frames[n], episodes[number].frames[start : start + 4])
             np.testing.assert_allclose(some.actions[n], episodes[number].actions[start : start + 3], atol=1e-7)
@@ -172,15 +162,18 @@ def test_windows_are_stretches_of_the_episodes(data):
 
 def test_files_without_frames_and_of_other_kinds_are_refused(data, tmp_path):
     with pytest.raises(CorruptFile, check=about("no frames")):
-        VideoFiles((write_videos(tmp_path / "plain.h5", count=2, with_frames=False),))
+        training.VideoFiles((write_videos(tmp_path / "plain.h5", count=2, with_frames=False),))
     with pytest.raises(CorruptFile, check=about("1 actions")):
-        VideoFiles((write_videos(tmp_path / "short.h5", count=2, steps=1),))
+        training.VideoFiles((write_videos(tmp_path / "short.h5", count=2, steps=1),))
     with pytest.raises(InvalidInput, check=about("sizes")):
-        VideoFiles((data, write_videos(tmp_path / "large.h5", side=32, count=2)))
+        training.VideoFiles((data, write_videos(tmp_path / "large.h5", side=32, count=2)))
+    (tmp_path / "text.h5").write_text("not a push file")
+    with pytest.raises(CorruptFile, check=about("text.h5")):
+        training.VideoFiles((tmp_path / "text.h5",))
     never_meet = ("005_tomato_soup_can", "010_potted_meat_can")
     for name, more in (("one", {"count": 1}), ("pair", {"names": never_meet})):
         with pytest.raises(InvalidInput, check=about("learn from")):
-            VideoFiles((write_videos(tmp_path / f"{name}.h5", **more),))
+            training.VideoFiles((write_videos(tmp_path / f"{name}.h5", **more),))
 
 
 # Measurement
@@ -188,7 +181,7 @@ def test_files_without_frames_and_of_other_kinds_are_refused(data, tmp_path):
 
 def test_means_are_of_each_horizon_and_of_each_frames_own_psnr():
     predicted = np.tile(np.geomspace(1e-4, 1e-2, 40), (3, 1))
-    report = VideoErrors(predicted, 10 * predicted).report()
+    report = training.VideoErrors(predicted, 10 * predicted).report()
     assert list(report["horizons"]) == ["10", "30"]
     assert len(report["steps"]) == 40
     for horizon in (10, 30):
@@ -201,8 +194,8 @@ def test_means_are_of_each_horizon_and_of_each_frames_own_psnr():
 def test_predictions_are_compared_with_the_frames_after_the_context(data):
     torch.manual_seed(0)
     network = FitVidModel(FitVidSettings(side=16, width=1, features=6, hidden=8, latent=2)).eval()
-    with VideoFiles((data,)) as files:
-        (errors,) = measure(network, files.held_out)
+    with training.VideoFiles((data,)) as files:
+        (errors,) = training.measure(network, files.held_out)
     assert errors.predicted.shape == (2, 5)
     for row, number in enumerate((0, 12)):
         episode = read_pushes(data)[number]
