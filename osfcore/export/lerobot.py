@@ -102,15 +102,9 @@ Statistics = dict[str, np.ndarray]
 
 def statistics_of(values: Float[np.ndarray, "T D"]) -> Statistics:
     """Compute the statistics of each of D numbers over T rows."""
+    moments = {name: getattr(values, name)(axis=0) for name in ("min", "max", "mean", "std")}
     quantiles = dict(zip(_QUANTILES, np.quantile(values, list(_QUANTILES.values()), axis=0), strict=True))
-    return {
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
-        "count": np.array([len(values)]),
-        **quantiles,
-    }
+    return {**moments, "count": np.array([len(values)]), **quantiles}
 
 
 def image_statistics(images: UInt8[np.ndarray, "T h w 3"]) -> Statistics:

@@ -70,12 +70,8 @@ def _fits(image: BopImage, name: str) -> bool:
     return bool(np.all((place > 2 * low - high) & (place < 2 * high - low)))
 
 
-def bop_sheet(images: Sequence[BopImage]) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw a tile for each of up to eight images, BGR: outlines of masks, and 5 cm axes of each annotated object."""
-    return tiled([_tile(image) for image in images[:_MOST_TILES]])
-
-
 def _tile(image: BopImage) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw the outlines of masks, and 5 cm axes of each annotated object, into an image, BGR."""
     bgr = cv2.resize(to_uint8(image.picture[..., ::-1]), (_SIDE, _SIDE * 3 // 4), interpolation=cv2.INTER_AREA)
     camera = image.camera.resized(bgr.shape[1], bgr.shape[0])
     for number, (name, pose) in enumerate(image.poses.items()):
@@ -238,7 +234,7 @@ def draw_overlay(path: Path, out: Path) -> None:
     For some images of a set that is the world's axes (x red, y green, z blue), the direction of the light (yellow) and
     the box that holds every silhouette (magenta). Where cameras and silhouettes contradict each other there is no such
     box; one of about the object's size is drawn where most cameras look, and lies beside the silhouettes. For an
-    observation see `observation_sheet`, for a scene of BOP `bop_sheet`.
+    observation see `observation_sheet`; a scene of BOP has a tile for each of its first eight images.
 
     Args:
         path: folder of an observation or scene of BOP, or folder or zip of an image set; it may be a set in which
@@ -254,7 +250,7 @@ def draw_overlay(path: Path, out: Path) -> None:
     if is_observation(path):
         sheet = observation_sheet(read_observation(path))
     elif is_bop_scene(path):
-        sheet = bop_sheet(read_images(path))
+        sheet = tiled([_tile(image) for image in read_images(path)[:_MOST_TILES]])
     else:
         with _unpacked(path) as folder:
             sets = (read_image_set(folder, "train"), read_image_set(folder, "test"))

@@ -679,7 +679,12 @@ def locate_board_through_lens(image: Image8, board: Board, intrinsics: Intrinsic
     found, lens = board_points_through_lens(image, board, intrinsics)
     size = image.shape[1], image.shape[0]
     if intrinsics is not None:
-        _check_focal(found, size, float(intrinsics[0, 0]))
+        free = fit_focal(found.points_m, found.points_px, size, ACCURACY_PX * px_scale(size))
+        given, is_sure = float(intrinsics[0, 0]), free is not None and free.focal_std < _SURE_STD * free.focal
+        ratio = given / free.focal if free is not None and is_sure else 1.0
+        if not 1 / _MOST_FACTOR < ratio < _MOST_FACTOR:
+            allowed = f"about {1 / ratio:.2f} times that, as the board in it shows; leave it out to have it found"
+            raise InvalidInput(CONTRADICTED, f"given as {given:.0f} at {size[0]} x {size[1]} pixels", allowed)
     view = board_view(found, size, intrinsics)
     return view, lens or Lens(view.intrinsics, 0.0)
 
@@ -734,19 +739,6 @@ def _fitted(points_m: Points, points_px: Points, size: tuple[int, int], intrinsi
     if not (_SURE * std < abs(radial) < _MOST_RADIAL and abs(radial) * reach**3 * K[0, 0] > _LEAST_BEND_PX):
         return None
     return Lens(K, radial, std)
-
-
-def _check_focal(found: FoundPoints, size: tuple[int, int], given: float) -> None:
-    """Refuse a focal length that the board contradicts."""
-    free = fit_focal(found.points_m, found.points_px, size, ACCURACY_PX * px_scale(size))
-    if free is None or free.focal_std >= _SURE_STD * free.focal:
-        return
-    if not 1 / _MOST_FACTOR < given / free.focal < _MOST_FACTOR:
-        raise InvalidInput(
-            CONTRADICTED, f"given as {given:.0f} at {size[0]} x {size[1]} pixels",
-            f"about {free.focal / given:.2f} times that, as the board in it shows; "
-            "leave it out to let the board tell it",
-        )  # fmt: skip
 
 
 # The page with the calibration board, to print.

@@ -504,17 +504,10 @@ def assess(views: Sequence[Sighting], table: Sighting | None = None, T_world_boa
     focal_std = float(np.sqrt(spread[0, 0]))
     names = [view.name for view in every]  # many phones call each photograph image.jpg
     names = [f"{name} ({names[:k].count(name) + 1})" if name in names[:k] else name for k, name in enumerate(names)]
-    return Calibration(
-        size,
-        fit.lens,
-        focal_std * float(np.exp(fit.theta[0])),
-        fit.noise_px,
-        dict(zip(names, fit.rms_px.tolist(), strict=True)),
-        None if table is None else T_world_board @ pose_of(fit.poses[-1]).inverse(),
-        error,
-        advice,
-        _missing(len(every), focal_std, error, advice),
-    )
+    rms_px = dict(zip(names, fit.rms_px.tolist(), strict=True))
+    pose = None if table is None else T_world_board @ pose_of(fit.poses[-1]).inverse()
+    missing, focal_std_px = _missing(len(every), focal_std, error, advice), focal_std * float(np.exp(fit.theta[0]))
+    return Calibration(size, fit.lens, focal_std_px, fit.noise_px, rms_px, pose, error, advice, missing)
 
 
 def _error_on_table(

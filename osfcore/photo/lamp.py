@@ -24,6 +24,7 @@ Vectors = Float[np.ndarray, "P 3"]
 Colours = Float[np.ndarray, "P C"]
 PerPixel = Float[np.ndarray, "P"]
 Columns = Float[np.ndarray, "P K"]
+Jacobian = Float[np.ndarray, "P 3 count"]
 Light, Lights = Float[np.ndarray, "K"], Float[np.ndarray, "3 K"]  # of K terms: of one colour, and of all
 
 # The direction toward a lamp, from the shading of surfaces whose normals and albedo are known.
@@ -89,7 +90,6 @@ class LampFit:
         direction: unit vector toward the lamp, in the frame of the normals.
         std: of it, per axis, from the curvature of the residuals [rad].
         strength: light of the lamp on a surface that faces it, per colour, where the radiance of white is 1.
-        ambient: light from everywhere, per colour.
         gain: share of the squared residual of ambient light and harmonics that the lamp explains.
         is_diffuse: nothing speaks for a lamp; the direction then means little.
     """
@@ -97,7 +97,6 @@ class LampFit:
     direction: Vector
     std: float
     strength: Vector
-    ambient: Vector
     gain: float
     is_diffuse: bool
 
@@ -123,7 +122,7 @@ def fit_lamp(pixels: ShadedPixels, visible: Visibility = None) -> LampFit:
     gain = _gain(residual, without, weights)
     ambient, *gradient = harmonics.mean(axis=0)
     is_diffuse = light[:, -1].mean() <= 0 or not _speaks_for_lamp(gain, np.array(gradient), float(ambient))
-    return LampFit(direction, std, light[:, -1], light[:, 0], gain, bool(is_diffuse))
+    return LampFit(direction, std, light[:, -1], gain, bool(is_diffuse))
 
 
 def _solve(pixels: ShadedPixels, direction: Vector | None, visible: Visibility, weights: PerPixel) -> Solution:
@@ -561,21 +560,6 @@ _FINE_INVERSES = 0.1, 0.7, 1.3, 2.1
 _EVALUATIONS = 6  # of one refinement
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Refined:
-    """A lamp with the least weighted residual nearby.
-
-    Attributes:
-        lamp: where it is.
-        residual: weighted, there.
-        jacobian: of it with respect to the lamp's numbers, in steps.
-    """
-
-    lamp: LampShape
-    residual: Vectors
-    jacobian: Float[np.ndarray, "P 3 count"]
-
-
 class LampSearch:
     """Costs of lamps on the pixels of one scene.
 
@@ -586,6 +570,7 @@ class LampSearch:
     def __init__(self, pixels: LitPixels) -> None:
         self.pixels = pixels
         self._table, self._lifted = pixels.on_table, pixels.lifted()
+        self._parts = [part for part in (self._table, ~self._table) if part.any()]
         self.is_on_table = bool(self._table.any())
         """Whether the plane z = 0 is seen, so that the lamp is above it."""
         views = range(int(pixels.view.max()) + 1)
@@ -618,7 +603,9 @@ class LampSearch:
             residual[chosen] = radiance[chosen] - lit
         return Gains(residual, fitted, ambient, np.mean(gradients or [np.zeros(3)], axis=0))
 
-    def _on_objects(self, chosen: np.ndarray, share: PerPixel | None, weights: PerPixel, residual: Vectors) -> Lights:
+    def _on_objects(
+        self, chosen: np.ndarray, share: PerPixel | None, weights: PerPixel, residual: np.ndarray
+    ) -> Lights:
         """Fit the light of objects in one view; write the residual."""
         plain = np.column_stack([np.ones(len(chosen)), self.pixels.normals[chosen]])
         lit = plain if share is None else np.column_stack([plain, share])
@@ -635,8 +622,7 @@ class LampSearch:
     def cost(self, residual: Colours) -> float:
         """Return the logarithms of the mean absolute residual of objects and table, weighted by their pixels."""
         size = np.abs(residual).mean(axis=1)
-        parts = [part for part in (self._table, ~self._table) if part.any()]
-        return sum(float(part.mean() * np.log(size[part].mean() + 1e-6)) for part in parts)
+        return sum(float(part.mean() * np.log(size[part].mean() + 1e-6)) for part in self._parts)
 
     def weights(self, residual: Vectors) -> PerPixel:
         """Return weights as of absolute errors, by which misplaced shadows still count, over variances.
@@ -645,10 +631,9 @@ class LampSearch:
         shadow is no outlier by its contrast alone.
         """
         size, usual = np.sqrt((residual**2).mean(axis=1)), np.empty(len(residual))
-        for part in (self._table, ~self._table):
-            if part.any():
-                least = _LEAST_SHARE * float(np.median(self.pixels.radiance[part].mean(axis=1)))
-                usual[part] = max(1.4826 * float(np.median(size[part])), least, _LEAST_STD)
+        for part in self._parts:
+            least = _LEAST_SHARE * float(np.median(self.pixels.radiance[part].mean(axis=1)))
+            usual[part] = max(1.4826 * float(np.median(size[part])), least, _LEAST_STD)
         return 1 / np.sqrt(1 + (size / usual) ** 2) / usual**2
 
     def by_direction(self, centre: Vector) -> list[LampShape]:
@@ -667,12 +652,19 @@ class LampSearch:
 
     def ranked(self, lamps: Sequence[LampShape]) -> list[LampShape]:
         """Sort lamps, the best first; the table's brightness may vary smoothly: shadows count and no cone matters."""
-        grey, albedo = self._normalised(), self.pixels.albedo.mean(axis=1)
-        costs = [self.cost(self._left_over(lamp, grey, albedo)) for lamp in lamps]
+        grey, albedo = self.pixels.radiance.mean(axis=1), self.pixels.albedo.mean(axis=1)
+        for chosen in filter(len, [*self._objects_by_view, *self._table_by_view]):  # views then have about one exposure
+            grey[chosen] /= max(float(np.median(grey[chosen] / np.maximum(albedo[chosen], 1e-3))), 1e-6)
+        costs = [self.cost(self._left_over(lamp, grey[:, None], albedo)) for lamp in lamps]
         return [lamps[k] for k in np.argsort(costs, kind="stable")]
 
-    def refine(self, lamp: LampShape, weights: PerPixel, scale: float = 1.0) -> Refined:
-        """Refine a lamp by Levenberg and Marquardt's method, with central differences over `STEPS` times a scale."""
+    def refine(self, lamp: LampShape, weights: PerPixel, scale: float = 1.0) -> tuple[LampShape, Vectors, Jacobian]:
+        """Refine a lamp by Levenberg and Marquardt's method, with central differences over `STEPS` times a scale.
+
+        Returns:
+            The lamp with the least weighted residual nearby, that residual, and its derivatives by the lamp's numbers
+            in steps.
+        """
         steps, root = scale * STEPS[: lamp.count], np.sqrt(weights)[:, None]
 
         def cost(x: np.ndarray) -> np.ndarray:
@@ -685,17 +677,7 @@ class LampSearch:
         start = np.zeros(lamp.count)
         found = least_squares(cost, start, jacobian, method="lm", max_nfev=_EVALUATIONS)  # pyright: ignore[reportArgumentType]
         moved = lamp.moved(found.x * steps, above_table=self.is_on_table)
-        return Refined(moved, found.fun.reshape(-1, 3), found.jac.reshape(-1, 3, lamp.count) / scale)
-
-    def _normalised(self) -> Float[np.ndarray, "P 1"]:
-        """Return radiance, mean of the colours, such that views have about the same exposure."""
-        grey, albedo = self.pixels.radiance.mean(axis=1), self.pixels.albedo.mean(axis=1)
-        for view in np.unique(self.pixels.view):
-            for part in (self._table, ~self._table):
-                chosen = part & (self.pixels.view == view)
-                if chosen.any():
-                    grey[chosen] /= max(float(np.median(grey[chosen] / np.maximum(albedo[chosen], 1e-3))), 1e-6)
-        return grey[:, None]
+        return moved, found.fun.reshape(-1, 3), found.jac.reshape(-1, 3, lamp.count) / scale
 
     def _left_over(self, lamp: LampShape, grey: Float[np.ndarray, "P 1"], albedo: PerPixel) -> Float[np.ndarray, "P 1"]:
         """Return what a lamp does not explain of such radiance."""
@@ -761,7 +743,6 @@ class NearLampFit:
         log_distance_std: of the logarithm of its distance.
         strength: its light on a surface at the centre that faces it, per view and colour, where the radiance of white
             is 1: relative to the exposure, which is unknown. NaN where no object is seen.
-        ambient: light from everywhere, likewise.
         gain: share of the squared residual without a lamp that it explains.
         is_diffuse: nothing speaks for a lamp; the rest then means little.
     """
@@ -770,7 +751,6 @@ class NearLampFit:
     std: float
     log_distance_std: float
     strength: Float[np.ndarray, "views 3"]
-    ambient: Float[np.ndarray, "views 3"]
     gain: float
     is_diffuse: bool
 
@@ -815,21 +795,21 @@ def fit_near_lamp(pixels: LitPixels, centre: Vector) -> NearLampFit:
     search = LampSearch(pixels.about(_FINE_PIXELS))
     weights = np.ones(len(search.pixels.radiance))
     weights = search.weights(search.gains(start, weights).residual)
-    found = search.refine(start, weights)
+    lamp, residual, jacobian = search.refine(start, weights)
     for _ in range(_NEAR_ROUNDS):
-        weights = search.weights(search.gains(found.lamp, weights).residual)
-        found = search.refine(found.lamp, weights)
-    covariance = _covariance(found, search.pixels)
+        weights = search.weights(search.gains(lamp, weights).residual)
+        lamp, residual, jacobian = search.refine(lamp, weights)
+    covariance = _covariance(residual, jacobian, search.pixels)
     std = float(np.sqrt((covariance[0, 0] + covariance[1, 1]) / 2 + _POSE_STD_RAD**2))
-    log_std = float(np.sqrt(covariance[2, 2] + _POSE_STD_PER_M**2)) / found.lamp.inverse
-    under, without = search.gains(found.lamp, weights), search.gains(None, weights)
+    log_std = float(np.sqrt(covariance[2, 2] + _POSE_STD_PER_M**2)) / lamp.inverse
+    under, without = search.gains(lamp, weights), search.gains(None, weights)
     gain = _gain(under.residual, without.residual, weights)
     if search.is_on_table:  # nothing else explains shadows on a table
         is_lit = gain > _LEAST_TABLE_GAIN
     else:
         is_lit = _speaks_for_lamp(gain, without.gradient, float(np.nanmean(without.ambient)))
     is_diffuse = not (is_lit and np.nanmax(under.lamp, initial=0.0) > 0)
-    return NearLampFit(found.lamp, std, log_std, under.lamp, under.ambient, gain, is_diffuse)
+    return NearLampFit(lamp, std, log_std, under.lamp, gain, is_diffuse)
 
 
 def _start(pixels: LitPixels, centre: Vector) -> LampShape:
@@ -845,7 +825,7 @@ def _start(pixels: LitPixels, centre: Vector) -> LampShape:
         lamp, weights = first, flat
         for scale in _SCALES:
             weights = search.weights(search.gains(lamp, weights).residual)
-            lamp = search.refine(lamp, weights, scale).lamp
+            lamp, _, _ = search.refine(lamp, weights, scale)
         ends.append(lamp)
         costs.append(search.cost(search.gains(lamp, weights).residual))
     return ends[int(np.argmin(costs))]
@@ -862,12 +842,12 @@ def _with_cones(search: LampSearch, lamps: Sequence[LampShape], weights: np.ndar
     return [tried[k] for k in np.argsort(costs, kind="stable")]
 
 
-def _covariance(found: Refined, pixels: LitPixels) -> Float[np.ndarray, "count count"]:
+def _covariance(residual: Vectors, jacobian: Jacobian, pixels: LitPixels) -> Float[np.ndarray, "count count"]:
     """Return the covariance of the lamp's parameters: H^-1 (sum of g g^T over patches) H^-1, g a patch's gradient."""
-    count = found.lamp.count
-    curvature = np.einsum("pci,pcj->ij", found.jacobian, found.jacobian)
+    count = jacobian.shape[2]
+    curvature = np.einsum("pci,pcj->ij", jacobian, jacobian)
     curvature += np.diag((STEPS[:count] / _PRIOR_STD[:count]) ** 2)
-    gradients = np.einsum("pci,pc->pi", found.jacobian, found.residual)
+    gradients = np.einsum("pci,pc->pi", jacobian, residual)
     cells = np.column_stack([np.floor(pixels.points / _PATCH_M).astype(np.int64), pixels.owner])
     _, patch = np.unique(cells, axis=0, return_inverse=True)
     sums = np.stack([np.bincount(patch.reshape(-1), column) for column in gradients.T], axis=1)

@@ -13,6 +13,8 @@ from osfcore.errors import InvalidInput, shown
 from osfcore.geometry.poses import Pose
 from osfcore.photo.board import Intrinsics, checked_intrinsics
 
+Masks = Mapping[str, Bool[np.ndarray, "h w"]]  # by name of the object
+
 
 @dataclass(frozen=True, slots=True)
 class WindowFrame:
@@ -73,7 +75,7 @@ class Photograph:
     intrinsics: Intrinsics
     T_world_camera: Pose
     on_table: bool
-    masks: Mapping[str, Bool[np.ndarray, "h w"]] = field(default_factory=dict)
+    masks: Masks = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and numbers."""
@@ -106,7 +108,7 @@ class Photograph:
         """Width of the image [px]."""
         return self.image.shape[1]
 
-    def with_masks(self, masks: Mapping[str, Bool[np.ndarray, "h w"]]) -> Photograph:
+    def with_masks(self, masks: Masks) -> Photograph:
         """Return the same photograph with other masks.
 
         Raises:
@@ -138,13 +140,8 @@ class Photograph:
             if not mask.any():
                 allowed = f"larger, since nothing of {shown(name)} would be left"
                 raise InvalidInput("longest side of the photo [px]", longest, allowed)
-        return replace(
-            self,
-            image=np.clip(_averaged(self.image, size), 0, 1),
-            well_exposed=_averaged(~self.well_exposed, size) == 0,
-            intrinsics=self.intrinsics * per_axis,
-            masks=masks,
-        )
+        image, exposed = np.clip(_averaged(self.image, size), 0, 1), _averaged(~self.well_exposed, size) == 0
+        return replace(self, image=image, well_exposed=exposed, intrinsics=self.intrinsics * per_axis, masks=masks)
 
 
 def _averaged(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h w *c"]:

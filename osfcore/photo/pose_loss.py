@@ -105,21 +105,13 @@ def draw_surfels(points, normals, half, r, t, lens, nearest, index) -> None:
 @numba.njit(**_OPTIONS)
 def _fit_light(albedo, normals, r, index, compared, image, fitted) -> float:
     """Least squares of I = albedo * (a + b . n) for each colour on compared pixels; returns the squared residual."""
-    height, width = index.shape
-    count = 0
-    for row in range(height):
-        for column in range(width):
-            count += compared[row, column]
-    where, basis = np.empty((count, 2), np.int64), np.ones((count, _LIGHTS))
-    k = 0
-    for row in range(height):
-        for column in range(width):
-            if compared[row, column]:
-                s = index[row, column]
-                for c in range(3):
-                    basis[k, c + 1] = r[c, 0] * normals[s, 0] + r[c, 1] * normals[s, 1] + r[c, 2] * normals[s, 2]
-                where[k, 0], where[k, 1] = row, column
-                k += 1
+    where = np.argwhere(compared)
+    count = len(where)
+    basis = np.ones((count, _LIGHTS))
+    for k in range(count):
+        s = index[where[k, 0], where[k, 1]]
+        for c in range(3):
+            basis[k, c + 1] = r[c, 0] * normals[s, 0] + r[c, 1] * normals[s, 1] + r[c, 2] * normals[s, 2]
     fitted[:] = 0
     residual = 0.0
     normal, right = np.zeros((_LIGHTS, _LIGHTS)), np.zeros(_LIGHTS)

@@ -539,10 +539,8 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
         loss: whose windows the pose was found in.
     """
     if not fits_outline(best):
-        return (
-            f"The outline of {name} does not fit its mask (they share {100 * best.iou:.0f} %); "
-            "check the name, the mask and the camera."
-        )
+        share = f"they share {100 * best.iou:.0f} %"
+        return f"The outline of {name} does not fit its mask ({share}); check the name, the mask and the camera."
     if best.residual > _MOST_RESIDUAL:
         return f"{name} does not look like what the photo shows there; check the name and the mask."
     if rivals and rivals[0].loss < LEAST_RATIO * best.loss:

@@ -10,13 +10,13 @@ import io
 import struct
 import threading
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8, UInt16
+from jaxtyping import UInt8, UInt16
 from PIL import ExifTags, Image, ImageCms, ImageFile
 from PIL.TiffImagePlugin import TiffImageFile
 from pillow_heif import register_heif_opener
@@ -24,8 +24,8 @@ from pillow_heif import register_heif_opener
 from osfcore.errors import CorruptFile, OsfError, check_ranges, shown
 from osfcore.estimation.camera_response import Encoding, linear_from_encoded
 from osfcore.geometry.poses import Pose
-from osfcore.photo.board import camera_matrix
-from osfcore.photo.photograph import Photograph
+from osfcore.photo.board import Intrinsics, camera_matrix
+from osfcore.photo.photograph import Masks, Photograph
 
 FORMATS = ("PNG", "JPEG", "WEBP", "HEIF", "AVIF", "TIFF", "GIF", "BMP")
 MAX_PIXELS = 200_000_000
@@ -160,7 +160,7 @@ def _without_warnings() -> Iterator[None]:
                 _filters.close()
 
 
-def intrinsics_from_focal(width: int, height: int, focal_px: float) -> Float[np.ndarray, "3 3"]:
+def intrinsics_from_focal(width: int, height: int, focal_px: float) -> Intrinsics:
     """Return K of a camera with square pixels that looks through the middle of its image; pixel centres at +0.5.
 
     Raises:
@@ -171,25 +171,20 @@ def intrinsics_from_focal(width: int, height: int, focal_px: float) -> Float[np.
     return camera_matrix(focal_px, width / 2, height / 2)
 
 
-def guessed_intrinsics(raw: RawPhotograph) -> tuple[Float[np.ndarray, "3 3"], str]:
+def guessed_intrinsics(raw: RawPhotograph) -> tuple[Intrinsics, str]:
     """Return K as EXIF has it, else that of a phone's main camera, and a sentence that says which."""
     height, width = raw.encoded.shape[:2]
     if raw.focal_px is not None:
         note = f"The focal length, {raw.focal_px:.0f} pixels, is what the camera wrote into the photo."
         return intrinsics_from_focal(width, height, raw.focal_px), note
     focal = np.hypot(width, height) / 2 / np.tan(np.deg2rad(ASSUMED_DIAGONAL_DEG) / 2)
-    note = (
-        "The photo does not tell its focal length; that of a phone's main camera is assumed "
-        f"({ASSUMED_DIAGONAL_DEG:g} degrees from corner to corner), so distances may be off by a fifth."
-    )
+    phone = f"that of a phone's main camera is assumed ({ASSUMED_DIAGONAL_DEG:g} degrees from corner to corner)"
+    note = f"The photo does not say its focal length; {phone}, so distances may be off by a fifth."
     return intrinsics_from_focal(width, height, float(focal)), note
 
 
 def to_photograph(
-    raw: RawPhotograph,
-    intrinsics: Float[np.ndarray, "3 3"],
-    T_world_camera: Pose | None = None,
-    masks: Mapping[str, Bool[np.ndarray, "h w"]] | None = None,
+    raw: RawPhotograph, intrinsics: Intrinsics, T_world_camera: Pose | None = None, masks: Masks | None = None
 ) -> Photograph:
     """Compute the linear radiance of a decoded photo, and which of its pixels can be trusted.
 

@@ -33,6 +33,11 @@ def refused(path, datum):
         check_path(path)
 
 
+def described(path):
+    report = check_path(path)
+    return report.kind, dict(report.facts)
+
+
 def drawn(path, tmp_path, *colours, least=50):
     """The shape of a path's overlay, which has more than so many pixels of each colour."""
     draw_overlay(path, tmp_path / "overlay.png")
@@ -45,9 +50,8 @@ AXES = (0, 0, 255), (0, 255, 0), (255, 0, 0)
 
 
 def test_a_good_set_of_an_object_passes_with_its_size_and_its_overlay_shows_all(image_set, tmp_path):
-    report = check_path(image_set)
-    assert (report.kind, dict(report.facts)) == ("image set", {"train": 12, "test": 4})
-    size = [float(word) for word in report.summary.split(" of an object of ")[1].split(" x ")]
+    assert described(image_set) == ("image set", {"train": 12, "test": 4})
+    size = [float(word) for word in check_path(image_set).summary.split(" of an object of ")[1].split(" x ")]
     np.testing.assert_allclose(size, (1.0, 0.6, 0.4), atol=0.35)
     assert drawn(image_set, tmp_path, *AXES, (0, 255, 255), (255, 0, 255)) == (512, 1024, 3)
 
@@ -90,13 +94,10 @@ def test_push_files_are_checked(tmp_path):
         folder.combine(0)
     refused(tmp_path / "empty.h5", "no episodes")
     substates = {"sub_positions": np.zeros((2, 4, 1, 3)), "sub_quaternions": np.zeros((2, 4, 1, 4))}
-    assert check_path(push_file(tmp_path, **substates)).facts == {"episodes": 1, "steps": 2}
-    for name, wrong in (
-        ("pusher", np.full((3, 3), np.nan)),
-        ("actions", np.zeros(3)),
-        ("positions", np.zeros((4, 1, 3))),
-        ("sub_positions", np.zeros((2, 4, 2, 3))),
-    ):
+    assert described(push_file(tmp_path, **substates)) == ("push file", {"episodes": 1, "steps": 2})
+    wrong_shapes = {"actions": 3, "positions": (4, 1, 3), "sub_positions": (2, 4, 2, 3)}
+    wrongs = {"pusher": np.full((3, 3), np.nan), **{name: np.zeros(shape) for name, shape in wrong_shapes.items()}}
+    for name, wrong in wrongs.items():
         refused(push_file(tmp_path, **substates | {name: wrong}), f"{name} of episode 0")
 
 
@@ -105,9 +106,8 @@ def test_observations_are_described_and_drawn(tmp_path):
     masks[:3, 0, 4:9, 4:9] = True
     images = np.zeros((4, 16, 16, 3))
     write_observation(folder, Observation(default_cameras(16), images, ("a", "b"), masks, None, 0.0))
-    report = check_path(folder)
-    assert report.kind == "observation"
-    assert dict(report.facts) == {"cameras": 4, "objects": 2, "width": 16, "height": 16, "masks": 3}
+    facts = {"cameras": 4, "objects": 2, "width": 16, "height": 16, "masks": 3}
+    assert described(folder) == ("observation", facts)
     assert drawn(folder, tmp_path, AXES[0]) == (384, 4 * 384, 3)
     refused(folder / "observation.json", "observation.json")
     (folder / "mask_1_0.png").unlink()
@@ -119,22 +119,19 @@ def test_states_are_described(tmp_path):
     path = tmp_path / "state.json"
     for reason in ("", "a: it hides"):
         write_estimated(path, EstimatedState(state, np.zeros(1), np.zeros(1), 0.0, (reason,), reason))
-        report = check_path(path)
-        assert report.kind == "state"
-        assert dict(report.facts) == {"objects": 1, "trusted": not reason, "reason": reason}
+        assert described(path) == ("state", {"objects": 1, "trusted": not reason, "reason": reason})
     path.write_text(path.read_text().replace('"doubt": "', '"doubt": 3, "x": "'))
     refused(path, "doubt of object a")
 
 
 def test_actions_and_networks_are_described(tmp_path):
-    (tmp_path / "actions.json").write_text(json.dumps({"actions": [[[0.1, 0, 0]] * 4] * 2, "step_s": 0.2}))
-    report = check_path(tmp_path / "actions.json")
-    assert (report.kind, dict(report.facts)) == ("actions", {"sequences": 2, "steps": 4})
-    (tmp_path / "actions.json").write_text(json.dumps({"actions": [[[0.4, 0, 0]]]}))
-    refused(tmp_path / "actions.json", "action 0 of sequence 0")
+    path = tmp_path / "actions.json"
+    path.write_text(json.dumps({"actions": [[[0.1, 0, 0]] * 4] * 2, "step_s": 0.2}))
+    assert described(path) == ("actions", {"sequences": 2, "steps": 4})
+    path.write_text(json.dumps({"actions": [[[0.4, 0, 0]]]}))
+    refused(path, "action 0 of sequence 0")
     write_network(tmp_path / "pushes.safetensors", PropagationNetwork(8, 2))
-    report = check_path(tmp_path / "pushes.safetensors")
-    assert (report.kind, dict(report.facts)) == ("dynamics", {"hidden": 8, "steps": 2})
+    assert described(tmp_path / "pushes.safetensors") == ("dynamics", {"hidden": 8, "steps": 2})
     save_file({"x": np.zeros(3)}, tmp_path / "other.safetensors", metadata={"format": "other"})
     refused(tmp_path / "other.safetensors", "format")
 
@@ -164,9 +161,8 @@ def edit_bop(path, change):
 
 
 def test_a_good_scene_passes_and_its_overlay_shows_the_objects(folder, tmp_path):
-    report = check_path(folder)
-    assert report.kind == "scene of BOP"
-    assert dict(report.facts) == {"images": 4, "objects": 2, "masks": 8, "cameras in a world": 4}
+    facts = {"images": 4, "objects": 2, "masks": 8, "cameras in a world": 4}
+    assert described(folder) == ("scene of BOP", facts)
     assert drawn(folder, tmp_path, *AXES) == (288, 4 * 384, 3)
     edit_bop(folder / "scene_camera.json", lambda entry: entry.pop("cam_R_w2c"))
     assert check_path(folder).facts["cameras in a world"] == 0

@@ -26,11 +26,6 @@ def drawn(table, *layers, rng, noise=6.0):
     return np.clip(picture + noise * rng.standard_normal(picture.shape), 0, 255).astype(np.uint8)
 
 
-def turned_box(centre, sides, angle_deg):
-    corners = cv2.boxPoints((centre, sides, angle_deg)).round().astype(np.int32)
-    return cv2.fillConvexPoly(np.zeros((HEIGHT, WIDTH), np.uint8), corners, 1) > 0
-
-
 def disc(centre, radius):
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     return np.hypot(x - centre[0], y - centre[1]) < radius
@@ -53,17 +48,23 @@ def random_scene(seed):
     colour = table + 80 * away / np.linalg.norm(away)
     centre = (rng.uniform(80, 120), rng.uniform(65, 95))
     sides = (rng.uniform(50, 90), rng.uniform(40, 80))
-    shape = turned_box(centre, sides, rng.uniform(0, 90)) if rng.random() < 0.6 else disc(centre, rng.uniform(25, 50))
+    if rng.random() < 0.6:
+        corners = cv2.boxPoints((centre, sides, rng.uniform(0, 90))).round().astype(np.int32)
+        shape = cv2.fillConvexPoly(np.zeros((HEIGHT, WIDTH), np.uint8), corners, 1) > 0
+    else:
+        shape = disc(centre, rng.uniform(25, 50))
     layers = (textured(rng, colour, 30.0), shape)
     return drawn(textured(rng, table, 30.0), layers, rng=rng, noise=15.0), shape, centre
 
 
 @settings(max_examples=8)
-@given(seed=st.integers(0, 10_000), grown=st.floats(0.02, 0.1))
-def test_an_object_on_a_table_is_found(seed, grown):
+@given(seed=st.integers(0, 10_000), grown=st.floats(0.02, 0.1), other_seed=st.integers(0, 10))
+def test_an_object_on_a_table_is_found_by_a_mask_that_depends_on_its_input_alone(seed, grown, other_seed):
     image, shape, centre = random_scene(seed)
     found = propose_mask(image, box_around(shape, grown), np.array([centre]))
     assert overlap(found, shape) > 0.9
+    cv2.setRNGSeed(other_seed)
+    np.testing.assert_array_equal(propose_mask(image, box_around(shape, grown), np.array([centre])), found)
 
 
 def test_a_large_photo_is_no_different():
@@ -75,15 +76,6 @@ def test_a_large_photo_is_no_different():
     contours, _ = cv2.findContours(found.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     assert len(contours) == 1
     assert cv2.arcLength(contours[0], True) < 1.15 * cv2.arcLength(cv2.convexHull(contours[0]), True)
-
-
-def test_the_same_input_gives_the_same_mask_whatever_happened_before():
-    image, shape, centre = random_scene(2)
-    masks = []
-    for seed in (1, 2):
-        cv2.setRNGSeed(seed)
-        masks.append(propose_mask(image, box_around(shape), np.array([centre])))
-    np.testing.assert_array_equal(*masks)
 
 
 def test_the_click_says_which_of_two_objects_is_meant():
