@@ -8,12 +8,15 @@ import torch
 from osfcore.dynamics.graph import PropagationNetwork, unroll
 from osfcore.dynamics.motion import SUBSTEPS, Motion, Sweep, headings, lowest_point, pusher_path
 from osfcore.dynamics.shapes import MAP_SIDE, ObjectShape, ShapeTable, octahedral_directions
+from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, STEP_S
 from osfcore.io.push_file import EpisodeFolder, PushEpisode, save_episode
+from osfcore.render.reference import solid_field
 
+VOXEL = 0.004  # of a bracket
 BOX, CAN, GELATIN, APPLE = NAMES = ("003_cracker_box", "005_tomato_soup_can", "009_gelatin_box", "013_apple")
 
 
@@ -43,6 +46,20 @@ def angle_bracket() -> ObjectShape:
     return boxes(((0.04, 0.0, 0.0), (0.06, 0.02, 0.02)), ((0.0, 0.04, 0.0), (0.02, 0.06, 0.02)))
 
 
+def bracket() -> KiloOSF:
+    """The field of two arms along +x and +y, 10 cm long and 3 cm wide, that share an end at (-3.5, -3.5) cm."""
+    arm = np.array([0.05, 0.015, 0.02])
+
+    def depth(x):
+        arms = (arm - np.abs(x + [0, 0.035, 0])), (arm[[1, 0, 2]] - np.abs(x + [0.035, 0, 0]))
+        return np.maximum(*(sides.min(axis=-1) for sides in arms))
+
+    def normal(x):
+        return np.broadcast_to([0.0, 0, 1], x.shape)
+
+    return solid_field(depth, normal, np.full(3, 0.05), (0.5, 0.5, 0.5), voxel=VOXEL, hidden=8)
+
+
 def on_table(shape, x: float, y: float, turn=(0.0, 0.0, 0.0)) -> Pose:
     """An object turned by a rotation vector, its centre of mass over (x, y), touching the table."""
     quaternion = quaternion_exp(np.asarray(turn, float))
@@ -53,23 +70,15 @@ def on_table(shape, x: float, y: float, turn=(0.0, 0.0, 0.0)) -> Pose:
 def scene(shapes, placed: dict[str, tuple], pusher=(0.0, 0.0)) -> SceneState:
     """A state of objects given as name: arguments of `on_table`."""
     poses = [on_table(shapes[name], *where) for name, where in placed.items()]
-    pose = Pose(
-        np.array([p.position for p in poses]).reshape(-1, 3), np.array([p.quaternion for p in poses]).reshape(-1, 4)
-    )
+    position, quaternion = (np.array([getattr(p, part) for p in poses]) for part in ("position", "quaternion"))
+    pose = Pose(position.reshape(-1, 3), quaternion.reshape(-1, 4))
     return SceneState(tuple(placed), pose, Light(np.array([0.0, 0, 1])), np.array([*pusher, PUSHER_CENTRE_Z_M]))
 
 
 def crowd(shapes) -> SceneState:
     """Three objects in a row before the pusher, a little tilted as real ones are, and one far away."""
-    return scene(
-        shapes,
-        {
-            CAN: (0.06, 0.01, (0.004, 0.006, 0.4)),
-            GELATIN: (0.15, 0.0, (0.003, -0.005, 1.0)),
-            APPLE: (0.24, 0.02, (0.1, 0.2, 0.3)),
-            BOX: (-0.25, 0.2, (0.005, 0.004, 0.2)),
-        },
-    )
+    row = {CAN: (0.06, 0.01, (0.004, 0.006, 0.4)), GELATIN: (0.15, 0.0, (0.003, -0.005, 1.0))}
+    return scene(shapes, {**row, APPLE: (0.24, 0.02, (0.1, 0.2, 0.3)), BOX: (-0.25, 0.2, (0.005, 0.004, 0.2))})
 
 
 def moved_state(state: SceneState, angle: float, shift) -> SceneState:

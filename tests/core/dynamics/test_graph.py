@@ -72,9 +72,6 @@ def test_what_the_push_can_reach_is_in_the_graph_and_nothing_else(shapes, table)
     assert names_of(graph, state) == {CAN, GELATIN, APPLE}  # a row of neighbours, the box far away
     assert graph.touched.sum() == 1
     assert set(pairs_of(graph, state)) == {(CAN, GELATIN), (GELATIN, CAN), (GELATIN, APPLE), (APPLE, GELATIN)}
-
-
-def test_what_cannot_be_reached_is_in_no_graph(shapes, table):
     state = scene(shapes, {CAN: (0.08, 0.0), GELATIN: (0.16, -0.02)})
     graph = graph_of(table, shapes, state, velocity=(-0.3, 0.0))
     assert len(graph.scene) == len(graph.receiver) == len(graph.pair.gap.distance) == 0
@@ -230,12 +227,12 @@ def test_effects_travel_one_edge_a_step(steps):
     assert (changed > 0).tolist() == [k <= steps for k in range(4)]
 
 
-@pytest.mark.parametrize(("nodes", "pushed", "pairs"), [(1, 1, 0), (5, 0, 4), (0, 0, 0)])
-def test_any_number_of_nodes_and_edges(nodes, pushed, pairs):
-    g = graph(max(nodes, 1), pushed, pairs)
-    answer = network()(g[0][:nodes], *g[1:])
-    assert answer.shape == (nodes, MOTION)
-    assert torch.isfinite(answer).all()
+def test_any_number_of_nodes_and_edges():
+    for nodes, pushed, pairs in ((1, 1, 0), (5, 0, 4), (0, 0, 0)):
+        features, *edges = graph(max(nodes, 1), pushed, pairs)
+        answer = network()(features[:nodes], *edges)
+        assert answer.shape == (nodes, MOTION)
+        assert torch.isfinite(answer).all()
 
 
 # Substep
@@ -299,29 +296,20 @@ def test_a_round_trip_loses_no_more_than_half_precision(tmp_path, hidden, steps)
 BIAS = "decoder.4.bias"
 
 
-@pytest.mark.parametrize(
-    ("data", "reason"),
-    [
-        (lambda: b"not a network at all", "no network"),
-        (lambda: network_bytes(network())[:-1], "no network"),
-        (lambda: repacked({"format": "pushes-0"}), FORMAT),
-        (lambda: save(load(network_bytes(network()))), FORMAT),
-        (lambda: repacked({"hidden": None}), "no network"),
-        (lambda: repacked({"hidden": "many"}), "no network"),
-        (lambda: repacked({"hidden": "1000000"}), "out of range"),
-        (lambda: repacked({"steps": "0"}), "out of range"),
-        (lambda: repacked({"hidden": "17"}), "do not fit"),
-        (lambda: repacked(**{BIAS: None}), "do not fit"),
-        (lambda: repacked(more=torch.zeros(7)), "do not fit"),
-        (lambda: repacked(**{BIAS: torch.full((6,), float("nan"))}), "finite"),
-    ],
-)
-def test_files_that_hold_no_network_are_refused(tmp_path, data, reason):
-    path = tmp_path / "a.safetensors"
-    path.write_bytes(data())
-    with pytest.raises(CorruptFile, check=about(reason)) as caught:
-        read_network(path)
-    assert caught.value.path == str(path)
+def test_files_that_hold_no_network_are_refused(tmp_path):
+    path, whole = tmp_path / "a.safetensors", network_bytes(network())
+    for reason, files in {
+        "no network": (b"not a network at all", whole[:-1], repacked({"hidden": None}), repacked({"hidden": "many"})),
+        FORMAT: (repacked({"format": "pushes-0"}), save(load(whole))),
+        "out of range": (repacked({"hidden": "1000000"}), repacked({"steps": "0"})),
+        "do not fit": (repacked({"hidden": "17"}), repacked(**{BIAS: None}), repacked(more=torch.zeros(7))),
+        "finite": (repacked(**{BIAS: torch.full((6,), float("nan"))}),),
+    }.items():
+        for data in files:
+            path.write_bytes(data)
+            with pytest.raises(CorruptFile, check=about(reason)) as caught:
+                read_network(path)
+            assert caught.value.path == str(path)
 
 
 def test_the_shipped_network_is_small_and_whole(tmp_path):

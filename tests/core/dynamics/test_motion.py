@@ -48,12 +48,8 @@ def test_lowest_point_stands_on_the_table_it_was_put_on(shapes, table, number):
     low = np.array([rotate(one, points)[:, 2].min() for one in q])
     centre = np.zeros((50, 3))
     centre[:, 2] = 0.01 - low
-    heights = lowest_point(
-        table,
-        torch.full((50,), number),
-        torch.as_tensor(centre, dtype=torch.float32),
-        torch.as_tensor(q, dtype=torch.float32),
-    )
+    where = (torch.as_tensor(array, dtype=torch.float32) for array in (centre, q))
+    heights = lowest_point(table, torch.full((50,), number), *where)
     assert heights.min() > 0.01 - 1e-6  # of a point of the object
     assert heights.median() < 0.01 + 3e-4
 
@@ -173,18 +169,16 @@ def test_it_goes_where_it_is_told_and_never_beyond_its_reach(start, velocity):
     assert path.shape == (SUBSTEPS * len(velocity) + 1, 2)
     np.testing.assert_array_equal(path[0], start)
     assert np.all(np.abs(path) <= PUSHER_REACH_M)
-    told = np.repeat(velocity, SUBSTEPS, axis=0) * STEP_S / SUBSTEPS
+    asked = np.repeat(velocity, SUBSTEPS, axis=0) * STEP_S / SUBSTEPS
     went = np.diff(path, axis=0)
     inside = np.abs(path[1:]) < PUSHER_REACH_M  # per axis: it slides along the border
-    np.testing.assert_allclose(went[inside], told[inside], atol=1e-12)
-    assert np.all(np.abs(went) <= np.abs(told) + 1e-12)
+    np.testing.assert_allclose(went[inside], asked[inside], atol=1e-12)
+    assert np.all(np.abs(went) <= np.abs(asked) + 1e-12)
 
 
 def test_who_stands_outside_is_not_drawn_in_but_goes_no_farther():
-    starts, velocity = (
-        np.array([[0.4, 0.0], [0.0, 0.0]]),
-        np.array([[[0.3, 0.0], [-0.3, 0.0]], [[0.1, 0.2], [0.0, 0.0]]]),
-    )
+    starts = np.array([[0.4, 0.0], [0.0, 0.0]])
+    velocity = np.array([[[0.3, 0.0], [-0.3, 0.0]], [[0.1, 0.2], [0.0, 0.0]]])
     paths = pusher_path(starts, velocity)
     np.testing.assert_allclose(paths[0, : SUBSTEPS + 1, 0], 0.4, atol=1e-12)
     assert paths[0, -1, 0] == pytest.approx(0.34)

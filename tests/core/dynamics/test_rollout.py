@@ -16,8 +16,19 @@ from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
 from osfcore.fields.kiloosf import write_field
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotate, rotation_angle
 from osfcore.geometry.states import SceneState
-from tests.core.dynamics.scenes import APPLE, BOX, CAN, GELATIN, crowd, hull, moved_state, network, picked, scene
-from tests.core.dynamics.solids import bracket
+from tests.core.dynamics.scenes import (
+    APPLE,
+    BOX,
+    CAN,
+    GELATIN,
+    bracket,
+    crowd,
+    hull,
+    moved_state,
+    network,
+    picked,
+    scene,
+)
 from tests.support.errors import about
 from tests.support.rendered_scenes import ball
 
@@ -107,9 +118,7 @@ def test_turning_and_shifting_the_scene_turns_and_shifts_the_rollout(model, stat
 @pytest.mark.parametrize("seed", range(2))
 def test_nothing_sinks(shapes, state, seed):
     """Not below the table, nor below where it was estimated to begin with."""
-    sunk = SceneState(
-        state.names, Pose(state.poses.position - [0, 0, 0.002], state.poses.quaternion), state.light, state.pusher
-    )
+    sunk = replace(state, poses=Pose(state.poses.position - [0, 0, 0.002], state.poses.quaternion))
     for begin, floor in ((state, 0.0), (sunk, -0.002)):
         found = PushModel(network(seed), shapes).rollout(begin, plans(10, 5, seed))
         for slot, name in enumerate(begin.names):

@@ -32,8 +32,7 @@ from osfcore.fields.kiloosf import EMPTY_G
 from osfcore.geometry.polygons import gap_to_point
 from osfcore.geometry.torch_rotations import facing
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
-from tests.core.dynamics.scenes import NAMES, angle_bracket, boxes, hull
-from tests.core.dynamics.solids import VOXEL, bracket
+from tests.core.dynamics.scenes import NAMES, VOXEL, angle_bracket, boxes, bracket, hull
 from tests.support.rendered_scenes import ball, block
 
 # Object shapes
@@ -127,33 +126,23 @@ def test_a_bracket_has_parts_that_leave_its_corner_free():
     assert all(np.array_equal(a, b) for a, b in zip(parts, again, strict=True))
 
 
-def test_specks_do_not_count():
+def test_specks_do_not_count_and_what_a_lost_neck_bore_does():
     field = bracket()
-    density = field.density.copy()
     alone = field_mesh(field)[0]
-    density[-2:, -2:, -2:] = 3.0  # a speck in the free corner
-    object.__setattr__(field, "density", density)
+    field.density[-2:, -2:, -2:] = 3.0  # a speck in the free corner
     np.testing.assert_array_equal(field_mesh(field)[0], alone)
-
-
-def test_what_a_lost_neck_bore_counts():
     field = block((0.02, 0.02, 0.08), voxel=VOXEL)
-    density = field.density.copy()
-    density[:, :, density.shape[2] // 2 :][:, :, :2] = EMPTY_G
-    object.__setattr__(field, "density", density)
+    middle = field.density.shape[2] // 2
+    field.density[:, :, middle : middle + 2] = EMPTY_G
     vertices, _ = field_mesh(field)
     assert np.abs(vertices).max(axis=0) == pytest.approx(np.array([0.02, 0.02, 0.08]), abs=VOXEL)
-
-
-def test_a_field_without_a_solid_part_is_told():
-    field = ball(0.03, voxel=VOXEL)
-    object.__setattr__(field, "density", np.full_like(field.density, -9.0))
-    with pytest.raises(InvalidInput):
+    field.density[...] = -9.0
+    with pytest.raises(InvalidInput):  # nothing is solid
         field_mesh(field)
     assert field_parts(field) == ()
 
 
-def test_files_give_back_what_was_written_for_the_same_field(tmp_path):
+def test_files_give_back_what_was_written_for_the_same_field_and_anything_else_counts_as_missing(tmp_path):
     path = tmp_path / "new" / "parts.safetensors"
     parts = tuple(np.random.default_rng(0).random((n, 3)).astype(np.float32) for n in range(4, 16))
     write_parts(path, parts, "abc")
@@ -163,11 +152,7 @@ def test_files_give_back_what_was_written_for_the_same_field(tmp_path):
     assert read_parts(path, "abd") is None
     write_parts(path, (), "abc")
     assert read_parts(path, "abc") == ()
-
-
-def test_files_of_anything_else_count_as_missing(tmp_path):
-    path = tmp_path / "parts.safetensors"
-    assert read_parts(path, "abc") is None
+    assert read_parts(tmp_path / "none.safetensors", "abc") is None
     write_parts(path, (np.zeros((30, 3), np.float32),), "abc")
     whole = path.read_bytes()
     with safe_open(path, "numpy") as file:

@@ -1,9 +1,8 @@
 """Train: network training, holdout, optimizers, samples, windows."""
 
-import ast
 import itertools
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,6 @@ from osfcore.dynamics.rollout import load_shapes
 from osfcore.dynamics.shapes import ShapeTable
 from osfcore.dynamics.train import (
     Optimizers,
-    PushTraining,
     TrainDynamics,
     batch,
     distance,
@@ -101,19 +99,6 @@ def test_the_command_says_how_to_do_it_again(data, tmp_path):
     assert words.endswith(f"--iterations 5 --long-batch 7 --seed 3 --without {CAN} 'a b'")
 
 
-@pytest.mark.slow
-def test_a_killed_run_goes_on_to_the_same_weights(data, tmp_path, shapes, whole):
-    parts = config(data, tmp_path)
-    begun = train_dynamics(parts, shapes)
-    while next(begun).done < 20:  # where windows begin, it is measured and saved
-        pass
-    begun.close()
-    assert not parts.out.exists()
-    assert [s.done for s in train_dynamics(parts, shapes)] == [0, 22]
-    a, b = (load(settings.out.read_bytes()) for settings in (whole[0], parts))
-    assert all(torch.equal(a[name], b[name]) for name in a)
-
-
 def test_what_is_left_of_a_part_is_skipped_when_nothing_gets_better(data, tmp_path, shapes, monkeypatch):
     monkeypatch.setattr(training, "_MEASURE_LONG_EVERY", 1)
     settings = config(data, tmp_path, iterations=1, long_iterations=100, long_batch=1, patience=1, rate=1e-9)
@@ -121,7 +106,7 @@ def test_what_is_left_of_a_part_is_skipped_when_nothing_gets_better(data, tmp_pa
     assert metrics(settings)["iterations"] < 20
 
 
-def test_bad_settings_are_refused_and_nothing_is_written(data, tmp_path, shapes):
+def test_bad_settings_places_and_files_are_refused_before_anything_is_written(data, tmp_path, shapes):
     for subject, change in (
         ("number of iterations", {"iterations": 0}),
         ("batch", {"batch": 0}),
@@ -138,9 +123,6 @@ def test_bad_settings_are_refused_and_nothing_is_written(data, tmp_path, shapes)
         with pytest.raises(InvalidInput, check=about(subject)):
             list(train_dynamics(replace(config(data, tmp_path), **change), shapes))
     assert not list(tmp_path.iterdir())
-
-
-def test_bad_places_and_files_are_refused(data, tmp_path, shapes):
     good = config(data, tmp_path)
     with pytest.raises(InvalidInput):
         list(train_dynamics(replace(good, out=tmp_path / "net.pt"), shapes))
@@ -178,98 +160,44 @@ def test_recordings_in_which_nothing_is_touched_are_refused(tmp_path, shapes):
         list(train_dynamics(config(path, tmp_path), shapes))
 
 
-# The loop of a training, on a line to be learned
-
-
-@dataclass(frozen=True)
-class Miss:
-    mm_4: float
-    deg_4: float = 0.0
-
-
-class Line(PushTraining):
-    """y = 2 x + 1 with a random x in each step; measured and saved after every eighth one."""
-
-    measurement, score = Miss, "mm_4"
-
-    def __init__(self, out, *, patience=100, aim=(2, 1), seed=0):
-        self.aim = aim
-        self.line = torch.nn.Linear(1, 1)
-        torch.nn.init.zeros_(self.line.weight)
-        torch.nn.init.zeros_(self.line.bias)
-        self.descent = torch.optim.Adam(self.line.parameters(), lr=0.1)
-        parts = {"line": self.line, "descent": self.descent}
-        super().__init__(self.line, parts, repr(seed), out=out, total=50, patience=patience, seed=seed)
-
-    def iterate(self):
-        x = torch.as_tensor(self.rng.random((4, 1)), dtype=torch.float32)
-        self.descent.zero_grad()
-        (self.line(x) - 2 * x - 1).square().mean().backward()
-        self.descent.step()
-        self.done += 1
-        return self.note
-
-    def is_due(self):
-        return self.done % 8 == 0
-
-    def measured(self):
-        (weight,), bias = self.line.weight.tolist()[0], self.line.bias.item()
-        return Miss(abs(weight - self.aim[0]) + abs(bias - self.aim[1])), self.line
-
-    def described(self):
-        return repr([p.tolist() for p in self.line.parameters()]).encode(), {"iterations": self.done}
-
-
-def begin_and_kill(out: Path, **settings) -> Path:
-    """The checkpoint that a run leaves behind, of its 16th step."""
-    steps = Line(out, **settings).run()
-    assert next(steps).done == 20
+def killed(settings: TrainDynamics, shapes) -> Path:
+    """The checkpoint that a run leaves behind where windows begin."""
+    steps = train_dynamics(settings, shapes)
+    while next(steps).done < 20:
+        pass
     steps.close()
-    return out.with_suffix(".checkpoint")
+    assert not settings.out.exists()
+    return settings.out.with_suffix(".checkpoint")
 
 
-def test_a_killed_run_goes_on_and_ends_as_a_whole_one(tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    list(Line(whole / "a.bin").run())
-    begin_and_kill(parts / "a.bin")
-    assert [p.name for p in parts.iterdir()] == ["a.checkpoint"]
-    assert [step.done for step in Line(parts / "a.bin").run()] == [20, 40, 50]
-    for name in ("a.bin", "a.json"):
-        assert (parts / name).read_bytes() == (whole / name).read_bytes()
-    assert sorted(p.name for p in parts.iterdir()) == ["a.bin", "a.json"]
-
-
-@pytest.mark.parametrize("damage", ["other settings", "cut short", "rubbish"])
-def test_a_checkpoint_that_does_not_fit_is_not_gone_on_with(tmp_path, damage):
-    out, whole = tmp_path / "a.bin", tmp_path / "whole.bin"
-    checkpoint = begin_and_kill(out, seed=1 if damage == "other settings" else 0)
+@pytest.mark.parametrize("damage", ["none", "other settings", "cut short", "rubbish"])
+def test_a_killed_run_goes_on_unless_its_checkpoint_does_not_fit_and_ends_with_the_same_weights(
+    data, tmp_path, shapes, whole, damage
+):
+    settings = config(data, tmp_path)
+    checkpoint = killed(replace(settings, seed=1) if damage == "other settings" else settings, shapes)
     content = checkpoint.read_bytes()
-    if damage != "other settings":
+    if damage in ("cut short", "rubbish"):
         checkpoint.write_bytes(content[: len(content) // 2] if damage == "cut short" else b"rubbish")
-    list(Line(out).run())
-    list(Line(whole).run())
-    assert out.read_bytes() == whole.read_bytes()
+    done = [step.done for step in train_dynamics(settings, shapes)]
+    assert done == ([0, 22] if damage == "none" else [0, 20, 22])
+    a, b = (load(one.out.read_bytes()) for one in (whole[0], settings))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert metrics(settings) == metrics(whole[0])
+    assert not checkpoint.exists()
 
 
-@pytest.mark.parametrize("lost", ["line", "best", "rng"])
-def test_a_checkpoint_that_cannot_be_gone_on_from_ends_the_training_and_stays(tmp_path, lost):
-    checkpoint = begin_and_kill(tmp_path / "a.bin")
+@pytest.mark.parametrize("lost", ["descent", "best", "rng"])
+def test_a_checkpoint_that_cannot_be_gone_on_from_ends_the_training_and_stays(data, tmp_path, shapes, lost):
+    settings = config(data, tmp_path)
+    checkpoint = killed(settings, shapes)
     content = torch.load(checkpoint)
     torch.save({key: value for key, value in content.items() if key != lost}, checkpoint)
     kept = checkpoint.read_bytes()
-    with pytest.raises(CorruptFile, check=about("a.checkpoint")):
-        list(Line(tmp_path / "a.bin").run())
+    with pytest.raises(CorruptFile, check=about("net.checkpoint")):
+        list(train_dynamics(settings, shapes))
     assert checkpoint.read_bytes() == kept
-    assert not (tmp_path / "a.bin").exists()
-
-
-def test_a_run_ends_when_nothing_gets_better_and_the_best_weights_are_written(tmp_path):
-    *_, last = Line(tmp_path / "a.bin", patience=2, aim=(0, 0)).run()  # where it begins, so that it only gets worse
-    found = json.loads((tmp_path / "a.json").read_text())
-    assert (found["iterations"], last.done, last.total) == (24, 50, 50)
-    [[weight]], [bias] = ast.literal_eval((tmp_path / "a.bin").read_text())
-    assert found["validation_mm_4"] == pytest.approx(weight + bias, abs=1e-3)
-    assert weight + bias < 2 * 8 * 0.1 + 1e-3  # Adam goes no faster than its rate: those after eight steps
+    assert not settings.out.exists()
 
 
 @pytest.fixture(scope="module")

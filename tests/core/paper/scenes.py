@@ -1,4 +1,4 @@
-"""Scenes, recordings and networks for tests of the paper's model: two objects that the pusher shoves along x."""
+"""Scenes, recordings, networks and fields for tests of the paper's models: the pusher shoves two objects along x."""
 
 import numpy as np
 import torch
@@ -9,10 +9,12 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, STEP_S
 from osfcore.io.push_file import PushEpisode
 from osfcore.paper.dynamics import GraphNetwork, Scenes
+from osfcore.paper.fields import TinyField, first_field, layer_shapes
 
 NAMES = CAN, BOX = ("005_tomato_soup_can", "009_gelatin_box")
 KAPPAS = {CAN: 0.1, BOX: 0.08}
 LONGEST = 0.12  # kappa of the pusher, its height [m]: larger than theirs
+WIDTH, VOXEL = 8, 0.005  # of tiny networks, and of their grids
 TOUCHED_M = 0.05  # in recordings, the pusher takes along what is no farther than this
 
 
@@ -58,3 +60,29 @@ def episode(seed: int = 0, *, steps: int = 8, names=NAMES, side: float | None = 
     quaternions = np.tile([1.0, 0, 0, 0], (steps + 1, len(names), 1))
     contact = np.linalg.norm(np.diff(positions, axis=0), axis=-1) > 0
     return PushEpisode(tuple(names), seed, positions, quaternions, pusher, actions, contact)
+
+
+# KiloOSFs as published whose answers are known: networks that ignore where they are asked.
+
+
+def empty_block(shape=(13, 11, 9), *, across: int = 3, seed: int = 0, width: int = WIDTH) -> TinyField:
+    """A grid around the origin, occupied but for its outermost corners, with random networks."""
+    occupied = np.zeros(shape, bool)
+    occupied[1:-1, 1:-1, 1:-1] = True
+    origin = (-VOXEL * (np.array(shape) - 1) / 2).astype(np.float32)
+    return first_field(origin, VOXEL, occupied, across=across, width=width, most_networks=1000,
+                       rng=np.random.default_rng(seed))  # fmt: skip
+
+
+def uniform_block(rho=(0.8, 0.4, 0.2), sigma: float = 4000.0, **kwargs) -> TinyField:
+    """The same, of one density [1/m] and one radiance transfer."""
+    field = empty_block(**kwargs)
+    parts, at = np.zeros_like(field.networks), 0
+    for number, (inputs, outputs) in enumerate(layer_shapes(field.width)):
+        biases = slice(at + inputs * outputs, at + (inputs + 1) * outputs)
+        if number == 2:
+            parts[:, biases.stop - 1] = np.log(np.expm1(sigma / field.density_scale))
+        if number == 4:
+            parts[:, biases] = np.log(np.array(rho) / (1 - np.array(rho)))
+        at = biases.stop
+    return TinyField(field.origin, field.voxel, field.occupied, field.cells, parts, field.width)

@@ -51,8 +51,5 @@ def test_it_looks_plans_and_acts_until_all_steps_are_done(library, models):
     assert steps[0].image_cost < 5e-3
     plans = [event for event in events if isinstance(event, Planning)]
     assert all(plan.round.actions.shape[0] == 2 for plan in plans)
-
-
-def test_masks_may_be_asked_for_at_every_step(library, models):
     events, _ = run(library, models, replace(FEW, has_masks=True))
     assert all(event.observation.masks is not None for event in events if isinstance(event, Observed))

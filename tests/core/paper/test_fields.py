@@ -4,7 +4,7 @@ import torch
 
 from osfcore.errors import CorruptFile
 from osfcore.paper.fields import TinyQuery, field_bytes, field_from_bytes, first_field, network_size, read_field
-from tests.core.paper.solids import VOXEL, empty_block, uniform_block
+from tests.core.paper.scenes import VOXEL, empty_block, uniform_block
 from tests.support.errors import about
 
 
@@ -22,9 +22,7 @@ def test_every_occupied_corner_lies_in_a_cell_with_a_network():
     assert (field.cells[tuple(cells.T)] >= 0).all()
     assert sorted(field.cells[field.cells >= 0]) == list(range(len(field.networks)))
     assert field.cells[4, 4, 4] == -1  # the middle is hollow
-
-
-def test_cells_grow_until_the_networks_fit():
+    # Cells grow until the networks fit.
     assert len(ball(8, 100).networks) <= 100 < len(ball(8, 1000).networks)
     assert len(ball(8, 1).networks) == 1
 
@@ -51,7 +49,7 @@ def test_density_is_the_same_with_and_without_directions_and_has_gradients():
     assert asked.sum() > 1
 
 
-def test_a_field_survives_its_file(tmp_path):
+def test_a_field_survives_its_file_and_damaged_ones_are_refused(tmp_path):
     field = empty_block()
     path = tmp_path / "a.safetensors"
     path.write_bytes(field_bytes(field))
@@ -61,10 +59,7 @@ def test_a_field_survives_its_file(tmp_path):
     np.testing.assert_allclose(read.networks, field.networks, atol=1e-3)
     assert (read.voxel, read.width) == (pytest.approx(VOXEL), field.width)
     assert read.networks.shape[1] == network_size(field.width)
-
-
-def test_damaged_files_are_refused(tmp_path):
-    data = field_bytes(empty_block())
+    data = path.read_bytes()
     with pytest.raises(CorruptFile, check=about("whole safetensors")):
         field_from_bytes(data[:-10], "field")
     with pytest.raises(CorruptFile, check=about("its format is")):

@@ -2,20 +2,16 @@ import numpy as np
 import pytest
 
 from osfcore.errors import InvalidInput
-from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S
 from osfcore.paper.mppi import GaussianMPPI, GaussianPlanSettings
+from tests.support.rendered_scenes import state
 
-STATE = SceneState(
-    ("a",), Pose(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])), Light(np.array([0, 0, 1.0])), np.zeros(3)
-)
+STATE = state({"a": (0, 0, 0)}, pusher=(0, 0, 0))
 
 
 def free_pusher(state, actions, before):
-    """Nothing is touched; the pusher goes where it is told."""
+    """Nothing is touched; the pusher goes where it is sent."""
     assert before is None
     count, horizon = actions.shape[:2]
     path = np.concatenate([np.zeros((count, 1, 3)), STEP_S * np.cumsum(actions, axis=1)], axis=1)

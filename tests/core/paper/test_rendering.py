@@ -9,7 +9,7 @@ from osfcore.paper.fields import TinyQuery
 from osfcore.paper.rendering import PaperRenderer
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import Quality, SceneBatch
-from tests.core.paper.solids import VOXEL, empty_block, uniform_block
+from tests.core.paper.scenes import VOXEL, empty_block, uniform_block
 from tests.support.errors import about
 from tests.support.rendered_scenes import block, camera_rays, plain_table, view
 

@@ -124,16 +124,14 @@ def moving(speed: float, turn: float):
     return record([replace(e, positions=positions, quaternions=quaternions)], STILL, KAPPAS, 4)
 
 
-def test_predicting_no_motion_errs_by_the_motion_of_what_moves():
+def test_predicting_no_motion_errs_by_the_motion_of_what_moves_or_of_everything():
     found = validate(STILL, moving(0.02, 0.1))
     assert found.windows == 5
     for mm in (found.mm_4, found.mean_mm_4, found.constant_mm_4):
         assert mm == pytest.approx(80, abs=1e-3)
     for deg in (found.deg_4, found.constant_deg_4):
         assert deg == pytest.approx(np.rad2deg(0.4), abs=0.1)
-
-
-def test_where_nothing_moves_everything_counts():
+    # Where nothing moves, everything counts.
     found = validate(STILL, moving(0.0, 0.0))
     assert (found.windows, found.mm_4, found.constant_mm_4) == (0, pytest.approx(0, abs=1e-3), pytest.approx(0))
     random = validate(network(), moving(0.0, 0.0))
