@@ -33,12 +33,12 @@ from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp
-from osfcore.geometry.states import SceneState
 from osfcore.planning.costs import PoseGoal
 from osfcore.planning.mppi import PlanSettings
 from osfcore.progress import Progress
 from osfcore.render.types import SceneBatch
 from tests.support.errors import about
+from tests.support.rendered_scenes import state
 from tests.support.tabletop_scenes import CAN, GELATIN, LIGHT, NAMES, models, sure, table
 
 DARK = ImageModel(np.full(3, 0.67), 1.0, np.ones(3), "srgb")
@@ -80,14 +80,13 @@ def oracle(world):
 
 
 def shifted(world, name=GELATIN, shift=(0.0, 0.0)) -> PoseGoal:
-    state = world.truth()
-    pose = state.pose(name)
-    return PoseGoal.of(state, {name: Pose(pose.position + [*shift, 0.0], pose.quaternion)})
+    pose = world.truth().pose(name)
+    return PoseGoal.of(world.truth(), {name: Pose(pose.position + [*shift, 0.0], pose.quaternion)})
 
 
-def toward_middle(world, name=GELATIN, length=0.08) -> PoseGoal:
-    place = world.truth().pose(name).position[:2]
-    return shifted(world, name, -length * place / np.linalg.norm(place))
+def toward_middle(world, length=0.08) -> PoseGoal:
+    place = world.truth().pose(GELATIN).position[:2]
+    return shifted(world, shift=-length * place / np.linalg.norm(place))
 
 
 def begun(oracle, goal, settings=SMALL, world=None, **more) -> Episode:
@@ -308,17 +307,13 @@ def test_what_is_lost_is_found_anywhere_on_the_table(world):
 # Adapted models
 
 OTHER = ImageModel(np.full(3, 0.5), 1.0, np.array([0.5, 0.6, 0.7]), "srgb")
-STATE = SceneState(NAMES, Pose(np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1))), LIGHT, None)
+STATE = state(dict.fromkeys(NAMES, (0, 0, 0)))
 
 
+# Taken as the first frame was; as usual cameras take it; explained by nothing; usual pictures are looked at once.
 @pytest.mark.parametrize(
     ("adapted", "trusts", "looks", "image_model"),
-    [
-        (True, "scene", 1, OTHER),  # taken as the first frame was
-        (True, "usual", 2, None),  # as the cameras would not take it, but as usual ones do
-        (True, "none", 2, OTHER),  # nothing explains it
-        (False, "none", 1, None),  # usual pictures are looked at once
-    ],
+    [(True, "scene", 1, OTHER), (True, "usual", 2, None), (True, "none", 2, OTHER), (False, "none", 1, None)],
 )
 def test_a_goal_image_is_taken_as_the_first_frame_was_or_as_a_usual_one(
     monkeypatch, adapted, trusts, looks, image_model
@@ -347,13 +342,7 @@ def test_a_goal_image_is_taken_as_the_first_frame_was_or_as_a_usual_one(
 
 # Monitoring
 
-UPRIGHT = np.array([1.0, 0, 0, 0])
-WATCHED = SceneState(
-    ("a", "b"),
-    Pose(np.array([[0.1, 0.0, 0.02], [-0.2, 0.05, 0.03]]), np.stack([UPRIGHT, UPRIGHT])),
-    Light(np.array([0.0, 0.3, 1])),
-    np.array([0.15, 0.0, 0.06]),
-)
+WATCHED = state({"a": (0.1, 0.0, 0.02), "b": (-0.2, 0.05, 0.03)}, (0.0, 0.3, 1), (0.15, 0.0, 0.06))
 
 
 @pytest.mark.parametrize(("turn", "is_other"), [([0, 0, 2.0], False), ([0.4, 0, 0], True)])
@@ -362,11 +351,8 @@ def test_what_is_turned_about_the_vertical_lies_on_the_same_side_and_what_rolled
     assert lies_otherwise(goal, WATCHED).tolist() == [is_other, False]
 
 
-@pytest.mark.parametrize(
-    ("number", "shift", "names"),
-    [(1, 0.06, ("b",)), (1, 0.01, ()), (0, 0.06, ())],  # what the pusher can reach may have been pushed
-)
-def test_an_object_that_moved_far_from_the_pusher_was_carried(number, shift, names):
-    position = WATCHED.poses.position.copy()
-    position[number, 1] += shift
-    assert moved_by_hand(WATCHED, replace(WATCHED, poses=Pose(position, WATCHED.poses.quaternion))) == names
+def test_an_object_that_moved_far_from_the_pusher_was_carried():
+    for number, shift, names in ((1, 0.06, ("b",)), (1, 0.01, ()), (0, 0.06, ())):  # what is in reach was pushed
+        position = WATCHED.poses.position.copy()
+        position[number, 1] += shift
+        assert moved_by_hand(WATCHED, replace(WATCHED, poses=Pose(position, WATCHED.poses.quaternion))) == names

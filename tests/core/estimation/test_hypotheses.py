@@ -17,11 +17,12 @@ from osfcore.estimation.hypotheses import (
     without_objects,
     yaw_hypotheses,
 )
-from osfcore.estimation.objective import QUALITY, SceneParameters, views_of
+from osfcore.estimation.objective import QUALITY, views_of
 from osfcore.estimation.search import GaussNewtonState, lit_table_level
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
 from tests.support.posed_scenes import BOTTLE, BOX, apart, lying, observe, own_views, params_of, scene, shipped_models
+from tests.support.rendered_scenes import state
 
 # Orientation hypotheses
 
@@ -61,15 +62,12 @@ def test_the_right_pose_stays(models, truth, coarse, fine):
 
 def test_a_ball_of_one_colour_is_a_close_call(plain):
     """It looks alike however it lies, up to the noise of the images."""
-    params = SceneParameters(
-        ("ball",), np.array([[0, 0, 0.05]]), np.array([[1.0, 0, 0, 0]]), np.array([0, 0.6, 0.8]), None
-    )
+    params = params_of(state({"ball": (0, 0, 0.05)}, (0, 0.6, 0.8)))
     views = own_views(plain, params, default_cameras(48)[:2])
     noise = np.random.default_rng(0).normal(0, 0.02, views.images.shape).astype(np.float32)
     views = replace(views, images=views.images + noise)
-    _, ratio = compare_orientations(
-        plain, views, views, views, GaussNewtonState.at(params), 0, yaw_hypotheses(plain, params, 0)
-    )
+    at, others = GaussNewtonState.at(params), yaw_hypotheses(plain, params, 0)
+    _, ratio = compare_orientations(plain, views, views, views, at, 0, others)
     assert 1 <= ratio < 1.05
 
 

@@ -78,19 +78,10 @@ def test_a_lit_table_that_is_brighter_than_all_else_is_not_taken_for_saturated(m
     assert found.model.ambient == pytest.approx(bright.ambient, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("gain", "ambient", "table"),
-    [
-        (0.7, 1.0, (1.0, 1.0, 1.0)),
-        (1.4, 1.0, (1.0, 1.0, 1.0)),
-        (1.0, 0.4, (1.0, 1.0, 1.0)),
-        (1.0, 3.0, (1.0, 1.0, 1.0)),
-        (1.0, 1.0, (0.5, 0.7, 1.0)),
-        (1.0, 1.0, (0.3, 0.3, 0.3)),
-    ],
-)
-def test_pictures_of_another_exposure_ambient_light_or_table_are_noticed(models, truth, gain, ambient, table):
-    model = ImageModel(np.full(3, gain), ambient, np.array(table))
+@pytest.mark.parametrize("change", [*({"gain": np.full(3, g)} for g in (0.7, 1.4)), {"ambient": 0.4}, {"ambient": 3.0},
+                                    *({"table": np.array(t)} for t in ((0.5, 0.7, 1), (0.3, 0.3, 0.3)))])  # fmt: skip
+def test_pictures_of_another_exposure_ambient_light_or_table_are_noticed(models, truth, change):
+    model = replace(ImageModel(np.ones(3), 1.0, np.ones(3)), **change)
     assert check_table(models, views_of(taken(models, truth, model), 64)) != "usual"
 
 

@@ -54,9 +54,13 @@ def density_at(field: KiloOSF, points) -> np.ndarray:
     return field.density[tuple(places.T)]
 
 
-@pytest.fixture(scope="module")
-def cup():
-    """A square cup, open at the top: a floor and four walls."""
+INSIDE = [(x, y, z) for x in (-0.02, 0, 0.02) for y in (-0.02, 0, 0.02) for z in (0, 0.015, 0.027)]
+WALLS = [(s * (HALF - 0.003), y, z) for s in (-1, 1) for y in (-0.02, 0, 0.02) for z in (-0.02, 0, 0.015)]
+FLOOR = [(x, y, 0.003 - DEEP) for x in (-0.02, 0, 0.02) for y in (-0.02, 0, 0.02)]
+
+
+@pytest.mark.slow
+def test_a_square_cup_that_is_open_at_the_top_is_opened_and_its_walls_stay():
     outer, inner = HALF, HALF - THIN
     floor = ((-outer, -outer, -DEEP), (outer, outer, THIN - DEEP))
     walls = (
@@ -66,23 +70,7 @@ def cup():
         ((-outer, inner, -DEEP), (outer, outer, DEEP)),
     )
     images = images_of(mesh_of(floor, *walls), -0.5)
-    return images, hull_of(images)
-
-
-@pytest.fixture(scope="module")
-def box():
-    images = images_of(mesh_of(((-HALF, -HALF, -DEEP), (HALF, HALF, DEEP))), -1.0)
-    return images, hull_of(images)
-
-
-INSIDE = [(x, y, z) for x in (-0.02, 0, 0.02) for y in (-0.02, 0, 0.02) for z in (0, 0.015, 0.027)]
-WALLS = [(s * (HALF - 0.003), y, z) for s in (-1, 1) for y in (-0.02, 0, 0.02) for z in (-0.02, 0, 0.015)]
-FLOOR = [(x, y, 0.003 - DEEP) for x in (-0.02, 0, 0.02) for y in (-0.02, 0, 0.02)]
-
-
-@pytest.mark.slow
-def test_a_cup_is_opened_and_its_walls_stay(cup):
-    images, hull = cup
+    hull = hull_of(images)
     assert np.all(density_at(hull, INSIDE) > 0)
     opened = open_hollows(hull, images, fog_g=-5.5)
     assert np.all(density_at(opened, INSIDE) <= -5.5)
@@ -91,11 +79,7 @@ def test_a_cup_is_opened_and_its_walls_stay(cup):
     fitted = without_fog(fit_voxels(opened, images, steps=120, rays=512, rng=np.random.default_rng(0)))
     assert np.all(density_at(fitted, INSIDE) <= FLOOR_G)
     assert np.all(density_at(fitted, WALLS) > 0)
-
-
-@pytest.mark.slow
-def test_a_lid_fits_worse_than_a_wall_however_bright_the_images(cup):
-    images, hull = cup
+    # A lid fits worse than a wall, however bright the images.
     misfit = surface_misfit(hull, images, hull.density > 0)
     darker = ImageSet(images.cameras, images.light_directions, images.rgba // np.array([2, 2, 2, 1], np.uint8))
     np.testing.assert_allclose(surface_misfit(hull, darker, hull.density > 0), misfit, atol=0.05)
@@ -107,16 +91,13 @@ def test_a_lid_fits_worse_than_a_wall_however_bright_the_images(cup):
     assert np.nanmax(misfit) <= 1
 
 
-def test_a_box_keeps_all_its_faces(box):
-    images, hull = box
+def test_a_box_keeps_all_its_faces_and_descent_lessens_what_its_colours_miss():
+    images = images_of(mesh_of(((-HALF, -HALF, -DEEP), (HALF, HALF, DEEP))), -1.0)
+    hull = hull_of(images)
     opened = open_hollows(hull, images, fog_g=-5.5)
     grid = np.linspace(-0.03, 0.03, 5)
     for z in (0.003 - DEEP, DEEP - 0.003):
         assert np.all(density_at(opened, [(x, y, z) for x in grid for y in grid]) > 0)
-
-
-def test_descent_lessens_what_colours_miss(box):
-    images, hull = box
     fitted = fit_voxels(hull, images, steps=100, rays=512, rng=np.random.default_rng(0))
     colours = fitted.rows[fitted.index[fitted.density > 0], 1:4]
     wanted = np.array([200, 120, 80]) / 255

@@ -18,7 +18,6 @@ from tests.support.errors import about
 
 FIELDS = FieldLibrary(None)
 SMALL = PlanSettings(samples=64, horizon=12)
-SHORT = PlanSettings(samples=64, horizon=12, refined=6)
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +77,8 @@ def test_planning_on_comes_closer_and_draws_proposals_in_every_third_plan_and_wh
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_second_round_looks_less_far_leaves_the_rest_alone_and_costs_no_more(shapes, start, seed):
-    goal = goal_of(start, (0.12, -0.08))
-    first, second = planned(MPPIPlanner(carried, PushProposals(shapes), SHORT), start, goal, seed)
+    goal, settings = goal_of(start, (0.12, -0.08)), replace(SMALL, refined=6)
+    first, second = planned(MPPIPlanner(carried, PushProposals(shapes), settings), start, goal, seed)
     assert first.rollouts.positions.shape[1] == 12 + 1
     assert second.rollouts.positions.shape[1] == 6 + 1
     np.testing.assert_array_equal(second.actions[6:], first.actions[6:])
@@ -89,7 +88,7 @@ def test_the_second_round_looks_less_far_leaves_the_rest_alone_and_costs_no_more
 @pytest.mark.parametrize(("refined", "every"), [(6, 3), (8, 2), (10, 5)])
 def test_noise_vanishes_where_the_refined_part_begins_and_ends(shapes, start, refined, every):
     """The goal is met, so that the best plan is to rest and paths are nothing but noise."""
-    settings = PlanSettings(samples=64, horizon=12, knot_every=every, refined=refined)
+    settings = replace(SMALL, knot_every=every, refined=refined)
     goal = PoseGoal.of(start, {})
     first, second = planned(MPPIPlanner(carried, PushProposals(shapes), settings), start, goal)
     np.testing.assert_array_equal(first.actions, 0)
@@ -145,10 +144,9 @@ def test_what_was_executed_is_dropped(shapes, start):
     planned(planner, start, goal)
     np.testing.assert_array_equal(seen[before][:-3], plan[3:])  # the first sample is the last plan itself
     np.testing.assert_array_equal(seen[before][-3:], 0)
-    planner.settings = PlanSettings(samples=64, horizon=5)
-    assert planned(planner, start, goal)[-1].actions.shape == (5, 3)
-    planner.settings = PlanSettings(samples=64, horizon=20)
-    assert planned(planner, start, goal)[-1].actions.shape == (20, 3)
+    for horizon in (5, 20):
+        planner.settings = replace(SMALL, horizon=horizon)
+        assert planned(planner, start, goal)[-1].actions.shape == (horizon, 3)
 
 
 class Straight:

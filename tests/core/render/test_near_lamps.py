@@ -8,23 +8,9 @@ import pytest
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import SpotLamp
-from osfcore.geometry.poses import quaternion_exp
-from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.paper.rendering import PaperRenderer
-from osfcore.render.reference import render_on_device
-from osfcore.render.renderer import SceneRenderer
-from osfcore.render.types import EXACT, OUTPUTS, PLANNING, Quality, SceneBatch
-from tests.support.rendered_scenes import (
-    UPRIGHT,
-    ball,
-    block,
-    both,
-    plain_table,
-    random_scene,
-    state,
-    view,
-    wooden_table,
-)
+from osfcore.render.types import SceneBatch
+from tests.support.rendered_scenes import block, both, plain_table, random_scene, state, view, wooden_table
 
 ALBEDO = 0.5  # of the plain table
 ROUNDING = 1e-5  # of sums of single precision: near lamps and distant lights are compiled apart
@@ -38,16 +24,6 @@ def seen_points(camera: Camera) -> np.ndarray:
     rays = camera.ray_directions(np.stack([x, y], axis=-1))
     origin = camera.T_world_camera.position
     return origin + rays * (-origin[2] / rays[..., 2:])
-
-
-def random_lamp(seed: int) -> SpotLamp:
-    rng = np.random.default_rng(seed)
-    z = rng.uniform(0.3, 1.0)
-    angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.3, 0.8)
-    flat = np.sqrt(1 - z**2)
-    place = distance * np.array([flat * np.cos(angle), flat * np.sin(angle), z])
-    inner = rng.uniform(10, 40)
-    return SpotLamp(place, np.array([*rng.uniform(-0.05, 0.05, 2), 0]), inner, inner + rng.uniform(0, 30))
 
 
 @pytest.mark.parametrize("spot", [LAMP, WIDE, SpotLamp(np.array([0, 0.1, 0.3]), np.array([0.1, 0, 0.05]), 20, 20)])
@@ -123,68 +99,12 @@ def test_sides_that_face_the_lamp_are_bright_and_others_are_not():
                 np.testing.assert_allclose(rendered.rgb[0, 0, 8, 8], np.array([0.3, 0.6, 0.8]) * expected, rtol=0.03)
 
 
-@pytest.mark.parametrize("seed", [1, 6, 9])
-def test_exact_is_the_reference(seed):
-    fields, scene = random_scene(seed)
-    table = None if seed % 3 == 0 else wooden_table(seed=seed)
-    camera = view(np.random.default_rng(seed).normal(size=3) * 0.1 + [0.35, 0, 0.3], size=16, fov_y_deg=50)
-    slow, fast = both(fields, table, scene, camera, spot=random_lamp(seed))
-    for name in ("rgb", "opacity", "depth"):
-        np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), atol=2e-3, err_msg=name)
-    there = render_on_device(fields, table, SceneBatch.of(scene, random_lamp(seed)), [camera], "cpu", EXACT, OUTPUTS)
-    np.testing.assert_allclose(there.rgb, fast.rgb, atol=2e-3)
-
-
 def test_a_trained_tables_answer_to_the_lights_direction_counts():
     """Its network is asked for the direction at every point."""
     rng = np.random.default_rng(0)
     w1, b1, w2 = (rng.normal(size=shape).astype(np.float32) for shape in ((3, 6), 6, (6, 3)))
     slow, fast = both({}, replace(wooden_table(), w1=w1, b1=b1, w2=0.3 * w2), state({}), view(size=24), spot=LAMP)
     np.testing.assert_allclose(fast.rgb, slow.rgb, atol=1e-5)
-
-
-@pytest.mark.parametrize("lamp", [(0.3, 0.1, 0.3), (0.12, 0.1, 0.12), (-0.2, 0.15, 0.05), (0.0, 0.05, 0.16)])
-def test_no_shadow_is_cut_off(lamp):
-    """A scene whose second, transparent object makes every pixel be looked at shows the same shadows."""
-    spot = SpotLamp(np.array(lamp), np.zeros(3), 89, 90)
-    fields = {"block": block(), "glass": block((0.7, 0.7, 0.1), voxel=0.1, g=-7.0)}
-    camera, tilt = view((0.3, 0.2, 0.6), (0, 0, 0), 48, 70), quaternion_exp(np.array([0.3, 0.5, 0]))
-    renderer = SceneRenderer(fields, plain_table(half_side=2.0))
-    for height in (0.06, 0.01):
-        poses, glass = {"block": ((0.05, 0, height), tilt)}, {"glass": ((0, 0, 0), UPRIGHT)}
-        scenes = (state(p, pusher=(-0.1, 0.1, PUSHER_CENTRE_Z_M)) for p in (poses, poses | glass))
-        a, b = (renderer.render(SceneBatch.of(s, spot), [camera]).rgb for s in scenes)
-        np.testing.assert_allclose(a, b, atol=1e-5)
-
-
-@pytest.mark.parametrize("quality", [EXACT, PLANNING, Quality(samples_per_side=2)])
-def test_a_batch_is_its_scenes_one_by_one(quality):
-    """Whose lamps are equal, or differ in nothing but the place, the aim or the cone."""
-    fields, scene = random_scene(9)
-    lamps = (LAMP, replace(LAMP, position=LAMP.position + 0.05), LAMP, replace(LAMP, aim=np.array([0.1, 0, 0])),
-             replace(LAMP, outer_deg=60), replace(LAMP, inner_deg=30))  # fmt: skip
-    one = SceneBatch.of(scene)
-    parts = [np.repeat(a, len(lamps), axis=0) for a in (one.positions, one.quaternions, one.lights)]
-    pusher = None if one.pusher is None else np.repeat(one.pusher, len(lamps), axis=0)
-    renderer = SceneRenderer(fields, wooden_table())
-    batch = SceneBatch(one.names, *parts, pusher, lamps)
-    whole = renderer.render(batch, [view(size=24)], quality=quality, outputs=OUTPUTS)
-    for b, spot in enumerate(lamps):
-        single = renderer.render(SceneBatch.of(scene, spot), [view(size=24)], quality=quality, outputs=OUTPUTS)
-        for name in ("rgb", "opacity", "masks", "depth"):
-            np.testing.assert_array_equal(getattr(whole, name)[b], getattr(single, name)[0], err_msg=name)
-    assert not any(np.array_equal(whole.rgb[0], whole.rgb[b]) for b in (1, 3, 4, 5))
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_planning_stays_above_40_db(seed):
-    rng = np.random.default_rng(seed)
-    fields = {"a": block(rng.uniform(0.02, 0.05, 3), voxel=0.002), "b": ball(rng.uniform(0.02, 0.05), voxel=0.002)}
-    scene = state({"a": (0.06, 0.02, 0.05), "b": (-0.07, -0.03, 0.05)}, pusher=(0, 0.12, PUSHER_CENTRE_Z_M))
-    renderer, batch = SceneRenderer(fields, wooden_table()), SceneBatch.of(scene, random_lamp(seed))
-    camera = Camera.look_at("0", (0.65, 0, 0.55), (0, 0, 0.04), size=128)
-    exact, planned = (renderer.render(batch, [camera], quality=quality).rgb for quality in (EXACT, PLANNING))
-    assert -10 * np.log10(np.mean((planned - exact) ** 2)) > 40
 
 
 def test_lamps_are_counted_and_the_published_renderer_takes_none():

@@ -66,7 +66,7 @@ def test_a_uniform_slab_hides_one_minus_exp_of_its_depth(g):
 def test_two_slabs_hide_as_much_as_their_depths_together():
     near, far = fog((0.05, 0.05, 0.01), g=-2.0), fog((0.05, 0.05, 0.02), g=-1.5)
     scene = state({"near": (0, 0, 0.2), "far": (0, 0, 0.05)}, ABOVE)
-    a, b = (fog_depth(f, g, h) for f, g, h in ((near, -2.0, 0.02), (far, -1.5, 0.04)))
+    a, b = fog_depth(near, -2.0, 0.02), fog_depth(far, -1.5, 0.04)
     for rendered in both({"near": near, "far": far}, None, scene, down(2.0, 16, 1.0), FINE):
         np.testing.assert_allclose(rendered.opacity[0, 0, 0], 1 - np.exp(-a), atol=1e-3)
         np.testing.assert_allclose(rendered.opacity[0, 0, 1], np.exp(-a) * (1 - np.exp(-b)), atol=1e-3)

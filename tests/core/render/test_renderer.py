@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.fields.kiloosf import MOST_HIDDEN, network_size
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.light import SpotLamp
+from osfcore.geometry.light import Light, SpotLamp
 from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.render.kernels import render_batch
+from osfcore.render.reference import render_on_device
 from osfcore.render.renderer import SceneRenderer, screen_boxes
 from osfcore.render.types import EXACT, MASK_OPACITY, MOST_OBJECTS, OUTPUTS, PLANNING, Quality, SceneBatch
 from tests.support.errors import about
@@ -39,8 +40,16 @@ CAMERAS = {
 }
 
 
-def drawn(fields, table, scene, *cameras, quality=EXACT):
-    return SceneRenderer(fields, table).render(SceneBatch.of(scene), cameras, quality=quality, outputs=OUTPUTS)
+def drawn(fields, table, scene, *cameras, quality=EXACT, spot=None):
+    return SceneRenderer(fields, table).render(SceneBatch.of(scene, spot), cameras, quality=quality, outputs=OUTPUTS)
+
+
+def random_lamp(seed: int) -> SpotLamp:
+    rng = np.random.default_rng(seed)
+    place = Light.from_angles(rng.uniform(-np.pi, np.pi), np.arcsin(rng.uniform(0.3, 1.0))).direction
+    inner = rng.uniform(10, 40)
+    aim = np.array([*rng.uniform(-0.05, 0.05, 2), 0])
+    return SpotLamp(rng.uniform(0.3, 0.8) * place, aim, inner, inner + rng.uniform(0, 30))
 
 
 def same(slow, fast, atol: float = 1e-3) -> None:
@@ -52,14 +61,18 @@ def same(slow, fast, atol: float = 1e-3) -> None:
 
 # Seeds are chosen so that one, two and four objects, pushers and lights down to 10 deg all occur.
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 6, 9, 11])
-def test_exact_is_the_reference(seed):
+@pytest.mark.parametrize(
+    ("seed", "spot"), [*((seed, None) for seed in (1, 2, 6, 9, 11)), *((seed, random_lamp(seed)) for seed in (1, 6, 9))]
+)
+def test_exact_is_the_reference(seed, spot):
     fields, scene = random_scene(seed)
     table = None if seed % 3 == 0 else wooden_table(seed=seed)
     camera = view(np.random.default_rng(seed).normal(size=3) * 0.1 + [0.35, 0, 0.3], size=16, fov_y_deg=50)
-    slow, fast = both(fields, table, scene, camera)
-    same(slow, fast)
+    slow, fast = both(fields, table, scene, camera, spot=spot)
+    same(slow, fast, 2e-3 if spot else 1e-3)
     assert fast.rgb.dtype == fast.opacity.dtype == fast.depth.dtype == np.float32
+    there = render_on_device(fields, table, SceneBatch.of(scene, spot), [camera], "cpu", EXACT, OUTPUTS)
+    np.testing.assert_allclose(there.rgb, fast.rgb, atol=2e-3)
 
 
 @pytest.mark.parametrize("name", CAMERAS)
@@ -102,8 +115,12 @@ def test_planning_stays_above_40_db(seed):
     poses = {name: (place, quaternion_exp(rng.normal(size=3))) for name, place in zip(fields, places, strict=True)}
     scene = state(poses, pusher=(0.05, -0.08, PUSHER_CENTRE_Z_M))
     camera = Camera.look_at("0", (0.65, 0, 0.55), (0, 0, 0.04), size=128)
-    exact, planned = (drawn(fields, wooden_table(), scene, camera, quality=q).rgb for q in (EXACT, PLANNING))
-    assert -10 * np.log10(np.mean((planned - exact) ** 2)) > 40
+    for spot in (None, random_lamp(seed)):
+        exact, planned = (
+            drawn(fields, wooden_table(), scene, camera, quality=quality, spot=spot).rgb
+            for quality in (EXACT, PLANNING)
+        )
+        assert -10 * np.log10(np.mean((planned - exact) ** 2)) > 40
 
 
 @pytest.mark.parametrize("quality", [EXACT, PLANNING])
@@ -131,7 +148,10 @@ def test_a_scene_of_a_batch_looks_as_it_does_alone(seed, near, has_pusher):
     lights = np.array([[0.5, 0.1, 0.86], [-0.8, 0.3, 0.52]])[(rng.uniform(size=scenes) < 0.2).astype(int)]
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
     pusher = np.array([[0.1, -0.1, PUSHER_CENTRE_Z_M], [-0.1, 0.1, PUSHER_CENTRE_Z_M]])[which[:, 0]]
-    spots = tuple(SpotLamp(np.array([0.1, 0.2, 0.5 + 0.1 * n]), np.zeros(3), 30, 40) for n in which[:, 1])
+    spots = tuple(
+        SpotLamp(np.array([0.1, 0.2, 0.5 + 0.1 * place]), np.array([0.1 * aim, 0, 0]), 30 - 10 * inner, 40 + 20 * outer)
+        for place, aim, inner, outer in rng.uniform(size=(scenes, 4)) < 0.3
+    )
     quality = PLANNING if rng.random() < 0.5 else EXACT
 
     def batch(rows: slice) -> SceneBatch:
@@ -230,25 +250,19 @@ def test_as_many_objects_as_allowed():
         batch(MOST_OBJECTS + 1)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("positions", np.zeros((2, 3))),
-        ("positions", np.full((2, 1, 3), np.nan)),
-        ("positions", np.full((2, 1, 3), 1e7)),
-        ("quaternions", np.zeros((2, 1, 4))),
-        ("quaternions", np.zeros((2, 2, 4))),
-        ("lights", np.full((2, 3), 0.1)),
-        ("lights", np.zeros((2, 4))),
-        ("pusher", np.zeros((1, 3))),
-    ],
-)
-def test_batches_that_make_no_sense_are_refused(name, value):
+def test_batches_that_make_no_sense_are_refused():
     good = {"names": ("ball",), "positions": np.zeros((2, 1, 3)), "quaternions": np.tile(UPRIGHT, (2, 1, 1)),
             "lights": np.array([[0, 0, 1.0]] * 2), "pusher": None}  # fmt: skip
     SceneBatch(**good)
-    with pytest.raises(InvalidInput, check=about(name)):
-        SceneBatch(**good | {name: value})
+    for name, values in {
+        "positions": (np.zeros((2, 3)), np.full((2, 1, 3), np.nan), np.full((2, 1, 3), 1e7)),
+        "quaternions": (np.zeros((2, 1, 4)), np.zeros((2, 2, 4))),
+        "lights": (np.full((2, 3), 0.1), np.zeros((2, 4))),
+        "pusher": (np.zeros((1, 3)),),
+    }.items():
+        for value in values:
+            with pytest.raises(InvalidInput, check=about(name)):
+                SceneBatch(**good | {name: value})
 
 
 @pytest.mark.wrong_arrays
@@ -326,35 +340,38 @@ def test_a_screen_box_holds_every_pixel_that_the_box_touches(seed):
         assert (right - left) * (bottom - top) == 0
 
 
-def test_a_screen_box_is_tight():
+def test_a_screen_box_is_tight_and_never_reaches_beyond_the_screen_whatever_the_numbers():
+    """Compiled code would write there."""
     camera = view((0, 0, 1), (0, 0, 0), 64, 53.13)  # half a metre to each side at the distance of 1 m
     left, right, top, bottom = screen_boxes((CORNERS * [0.25, 0.25, 0])[None, None], camera)[0][0, 0]
     np.testing.assert_allclose([left, right, top, bottom], [16, 48, 16, 48], atol=1)
+    for value in (np.inf, 1e308, np.nan):
+        points = np.full((1, 1, 8, 3), value)
+        points[0, 0, 0] = 0
+        with np.errstate(all="ignore"):
+            left, right, top, bottom = screen_boxes(points, camera)[0][0, 0]
+        assert 0 <= left <= right <= 64
+        assert 0 <= top <= bottom <= 64
 
 
-@pytest.mark.parametrize("value", [np.inf, 1e308, np.nan])
-def test_numbers_beyond_all_bounds_fill_the_screen(value):
-    """Rather than point outside of it, where compiled code would write."""
-    points = np.full((1, 1, 8, 3), value)
-    points[0, 0, 0] = 0
-    with np.errstate(all="ignore"):
-        left, right, top, bottom = screen_boxes(points, view((0, 0, 1), (0, 0, 0), 32))[0][0, 0]
-    assert 0 <= left <= right <= 32
-    assert 0 <= top <= bottom <= 32
-
-
-@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), [(0, 6), (100, 30), (250, 6), (100, 85)])
-def test_no_shadow_is_cut_off(azimuth_deg, elevation_deg):
+@pytest.mark.parametrize(
+    "light",
+    [
+        *(Light.from_angles(*np.deg2rad(angles)) for angles in ((0, 6), (100, 30), (250, 6), (100, 85))),
+        *((0.3, 0.1, 0.3), (0.12, 0.1, 0.12), (-0.2, 0.15, 0.05), (0.0, 0.05, 0.16)),
+    ],
+)
+def test_no_shadow_is_cut_off(light):
     """A scene whose second, transparent object makes every pixel be looked at shows the same shadows."""
-    a, e = np.deg2rad([azimuth_deg, elevation_deg])
-    light = (np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e))
+    spot = SpotLamp(np.array(light), np.zeros(3), 89, 90) if isinstance(light, tuple) else None
+    direction = (0.3, 0.2, 0.9) if spot else light.direction
     fields = {"block": block(), "glass": block((0.7, 0.7, 0.1), voxel=0.1, g=-7.0)}
     camera, tilt = view((0.3, 0.2, 0.6), (0, 0, 0), 48, 70), quaternion_exp(np.array([0.3, 0.5, 0]))
     for height in (0.06, 0.01):
         poses, glass = {"block": ((0.05, 0, height), tilt)}, {"glass": ((0, 0, 0), UPRIGHT)}
-        scenes = (state(p, light, (-0.1, 0.1, PUSHER_CENTRE_Z_M)) for p in (poses, poses | glass))
-        one, two = (drawn(fields, plain_table(half_side=2.0), scene, camera).rgb for scene in scenes)
-        np.testing.assert_allclose(one, two, atol=1e-6)
+        scenes = (state(p, direction, (-0.1, 0.1, PUSHER_CENTRE_Z_M)) for p in (poses, poses | glass))
+        one, two = (drawn(fields, plain_table(half_side=2.0), scene, camera, spot=spot).rgb for scene in scenes)
+        np.testing.assert_allclose(one, two, atol=1e-5 if spot else 1e-6)
 
 
 def test_no_batch_makes_the_compiler_work_again():
