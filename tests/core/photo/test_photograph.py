@@ -14,14 +14,14 @@ K = np.array([[90.0, 0, 31.0], [0, 92.0, 25.0], [0, 0, 1]])
 TABLE = Pose(np.array([0.1, -0.5, 0.7]), quaternion_exp(np.array([2.2, 0.1, 0.0])))
 
 
-def photograph(height=48, width=64, **changed):
-    image, exposed = np.random.default_rng(0).random((height, width, 3), np.float32), np.ones((height, width), bool)
+def photograph(**changed):
+    image, exposed = np.random.default_rng(0).random((48, 64, 3), np.float32), np.ones((48, 64), bool)
     return replace(Photograph(image, exposed, K, TABLE, True), **changed)
 
 
-def disc(height, width, centre=(30.0, 22.0), radius=14.0):
-    y, x = np.mgrid[:height, :width] + 0.5
-    return np.hypot(x - centre[0], y - centre[1]) < radius
+def disc(radius=14.0):
+    y, x = np.mgrid[:48, :64] + 0.5
+    return np.hypot(x - 30, y - 22) < radius
 
 
 @pytest.mark.wrong_arrays
@@ -57,7 +57,7 @@ def test_a_smaller_photo_shows_the_same_view(longest):
 
 
 def test_radiance_and_masks_are_averaged_over_areas():
-    whole = photograph(well_exposed=~disc(48, 64, radius=0.8)).with_masks({"mug": disc(48, 64)})
+    whole = photograph(well_exposed=~disc(0.8)).with_masks({"mug": disc()})
     small = whole.resized(16)
     np.testing.assert_allclose(small.image, whole.image.reshape(12, 4, 16, 4, 3).mean((1, 3)), atol=1e-6)
     shares = whole.masks["mug"].reshape(12, 4, 16, 4).mean((1, 3))
@@ -78,7 +78,7 @@ def test_a_pixel_is_well_exposed_only_if_all_that_it_is_made_of_is(longest, seed
 
 
 def test_a_photo_is_never_enlarged_nor_reduced_to_nothing():
-    whole = photograph(masks={"pin": disc(48, 64, radius=1.0)})
+    whole = photograph(masks={"pin": disc(1.0)})
     assert whole.resized(64) is whole.resized(1000) is whole
     for longest in (8, 0):
         with pytest.raises(InvalidInput, check=about("longest side")):
