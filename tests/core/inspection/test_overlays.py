@@ -14,9 +14,8 @@ AXES = ((0, 0, 255), (0, 255, 0), (255, 0, 0))
 TILE = 384
 
 
-def sheet_of(image_set, box=None):
-    sets = (read_image_set(image_set, "train"), read_image_set(image_set, "test"))
-    return overlay_sheet(sets, carve(*sets).box if box is None else box)
+def sets_of(image_set):
+    return read_image_set(image_set, "train"), read_image_set(image_set, "test")
 
 
 def count(image, colour) -> int:
@@ -25,7 +24,8 @@ def count(image, colour) -> int:
 
 
 def test_box_axes_and_light_are_drawn_around_the_object(image_set):
-    sheet = sheet_of(image_set)
+    sets = sets_of(image_set)
+    sheet = overlay_sheet(sets, carve(*sets).box)
     assert sheet.shape == (512, 1024, 3)
     assert all(count(sheet, colour) > 100 for colour in (MAGENTA, YELLOW, *AXES))
     for drawn in sheet.reshape(2, 256, 4, 256, 3).swapaxes(1, 2).reshape(8, 256, 256, 3):
@@ -38,9 +38,9 @@ def test_box_axes_and_light_are_drawn_around_the_object(image_set):
 
 def test_lines_that_pass_the_camera_are_cut_and_fewer_images_than_tiles_and_no_box_are_fine(image_set):
     around_cameras = np.array([[-0.1, -9, -9], [0.1, 9, 9]])  # all edges from +y to -y pass the cameras
-    assert count(sheet_of(image_set, around_cameras), MAGENTA) > 500
-    images = read_image_set(image_set, "test")
-    few = type(images)(images.cameras[:2], images.light_directions[:2], images.rgba[:2])
+    assert count(overlay_sheet(sets_of(image_set), around_cameras), MAGENTA) > 500
+    images = sets_of(image_set)[1]
+    few = replace(images, **{name: getattr(images, name)[:2] for name in ("cameras", "light_directions", "rgba")})
     sheet = overlay_sheet((few,), None)
     assert sheet.shape == (256, 1024, 3)
     assert not sheet[:, 512:].any()
