@@ -42,7 +42,7 @@ from osfcore.dynamics.shapes import (
 )
 from osfcore.errors import CorruptFile, shown
 from osfcore.geometry import torch_rotations as rotations
-from osfcore.geometry.polygons import Gap, dot
+from osfcore.geometry.polygons import Gap, circle, dot
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, STEP_S
 from osfcore.io.checkpoint import load_parameters, read_parameters
 from osfcore.io.files import write_atomically
@@ -322,10 +322,10 @@ def _quasistatic_sliding(graph: Graph, gap: Gap, turn: Float[Tensor, "A 3 3"]) -
 
 def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, quasistatic: Tensor) -> Float[Tensor, "A F"]:
     """Return extents in 34 directions, height over the table, motion, the pusher's motion, sliding and foot."""
-    slanted = functional.pad(_fan_of(SLANTED, turn), (0, 1))
+    slanted = functional.pad(circle(SLANTED, turn.device), (0, 1))
     vertical = slanted.new_tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     half = math.sqrt(0.5)
-    flat = functional.pad(_fan_of(AROUND, turn), (0, 1))
+    flat = functional.pad(circle(AROUND, turn.device), (0, 1))
     directions = torch.cat([flat, half * (slanted + vertical[0]), half * (slanted + vertical[1]), vertical])
     extents = table.extents(graph.number, turn @ graph.rotation, directions)
     height = graph.centre[:, 2:] - extents[:, -2:-1]
@@ -338,17 +338,12 @@ def _nodes(table: ShapeTable, graph: Graph, turn: Tensor, quasistatic: Tensor) -
 
 def _foot(table: ShapeTable, graph: Graph, turn: Tensor) -> Float[Tensor, "A 25"]:
     """Return the lowest points all around, on which friction acts, and their mean distance from the centre."""
-    fan = math.sin(FOOT_ANGLE) * _fan_of(FOOT, turn)
+    fan = math.sin(FOOT_ANGLE) * circle(FOOT, turn.device)
     downward = functional.pad(fan, (0, 1), value=-math.cos(FOOT_ANGLE))
     points = table.farthest(graph.number, turn @ graph.rotation, downward)
     height = MAGNIFIED * (points[..., 2] + graph.centre[:, None, 2])
     distance = points[..., :2].norm(dim=2).mean(dim=1, keepdim=True)
     return torch.cat([points[..., 0], points[..., 1], height, distance], dim=1) / LENGTH_M
-
-
-def _fan_of(count: int, like: Tensor) -> Float[Tensor, "D 2"]:
-    angles = torch.arange(count, device=like.device) * (2 * math.pi / count)
-    return torch.stack([angles.cos(), angles.sin()], dim=1)
 
 
 def _from_pusher(graph: Graph, pushed: Tensor, turn: Tensor) -> Tensor:

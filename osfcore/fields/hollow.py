@@ -30,6 +30,7 @@ from osfcore.fields.rays import (
     reshelled,
     within,
 )
+from osfcore.geometry.poses import fibonacci_sphere
 from osfcore.io.image_set import ImageSet
 
 # ruff: noqa: ANN001, ANN202 - compiled functions; types are given by their callers
@@ -107,21 +108,13 @@ def surface_misfit(
     eyes = (np.array([c.T_world_camera.position for c in cameras]) - field.origin) / field.voxel
     brightness = images.rgba[..., :3].sum(axis=-1, dtype=np.float32) / (3 * 255)
     found = np.empty(len(points), np.float32)
-    single = (points, to_pixels, eyes, images.light_directions, brightness, _directions(_NORMALS))
+    single = (points, to_pixels, eyes, images.light_directions, brightness, fibonacci_sphere(_NORMALS))
     arrays = [np.ascontiguousarray(a, np.float32) for a in single]
     with ONE_AT_A_TIME:
         _judge(found, solid, np.ascontiguousarray(images.rgba[..., 3] >= _OPAQUE), *arrays)
     misfit = np.full(solid.shape, np.nan, np.float32)
     misfit[tuple(points.T)] = np.where(found < 0, np.nan, found)
     return misfit
-
-
-def _directions(count: int) -> Float32[np.ndarray, "count 3"]:
-    """Spread unit vectors evenly: a Fibonacci lattice."""
-    number = np.arange(count) + 0.5
-    z, angle = 1 - 2 * number / count, np.pi * (1 + np.sqrt(5)) * number
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1).astype(np.float32)
 
 
 @numba.njit(fastmath=True, error_model="numpy")

@@ -222,7 +222,10 @@ def _field(hidden: int, tensors: Mapping[str, np.ndarray]) -> KiloOSF:
     for axis in range(3):
         if np.moveaxis(shell, axis, 0)[[0, -1]].any():
             raise ValueError("the shell touches the grid's faces")
-    vectors = {name: _vector(tensors, name, size) for name, size in _VECTORS.items()}
+    vectors = {name: tensors[name].astype(np.float32) for name in _VECTORS}
+    for name, vector in vectors.items():
+        if vector.shape != (_VECTORS[name],) or np.abs(vector).max() > _LARGEST:
+            raise ValueError(f"{name} of shape {vector.shape} and numbers up to {np.abs(vector).max(initial=0):g}")
     rows = np.concatenate([EMPTY_ROW, levels.astype(np.float32) / _LEVELS * vectors["span"] + vectors["low"]])
     cells, networks = tensors["cells"].astype(np.int32), tensors["networks"].astype(np.float32)
     if not 1 <= hidden <= MOST_HIDDEN or networks.shape != (len(networks), network_size(hidden)):
@@ -237,13 +240,6 @@ def _field(hidden: int, tensors: Mapping[str, np.ndarray]) -> KiloOSF:
         raise ValueError("ambient or span is negative")
     rows = rows.astype(np.float32)
     return KiloOSF(vectors["origin"], voxel, numbered(shell), rows, cells, networks, hidden, ambient)
-
-
-def _vector(tensors: Mapping[str, np.ndarray], name: str, size: int) -> Float32[np.ndarray, "size"]:
-    vector = tensors[name].astype(np.float32)
-    if vector.shape != (size,) or np.abs(vector).max() > _LARGEST:
-        raise ValueError(f"{name} of shape {vector.shape} and numbers up to {np.abs(vector).max(initial=0):g}")
-    return vector
 
 
 def read_tensors(path: Path, expected: str) -> Tensors:

@@ -152,17 +152,13 @@ class KiloQuery(nn.Module):
         starts = torch.repeat_interleave(torch.cumsum(counts, 0) - counts, counts)
         slot = slot + torch.arange(len(order), device=inputs.device) - starts
         batch = inputs.new_zeros(len(asked) * most, NETWORK_INPUTS).index_copy(0, slot, inputs[order])
-        out = self._layers(batch.view(len(asked), most, NETWORK_INPUTS), self.networks[asked]).reshape(-1, 3)[slot]
-        return torch.empty_like(out).index_copy(0, order, out)
-
-    def _layers(self, a: Float[Tensor, "C n 11"], networks: Float[Tensor, "C P"]) -> Float[Tensor, "C n 3"]:
-        start = 0
-        for inputs, outputs in ((NETWORK_INPUTS, self.hidden), (self.hidden, self.hidden), (self.hidden, 3)):
-            end = start + inputs * outputs
-            weights = networks[:, start:end].view(-1, inputs, outputs)
-            biases = networks[:, end : end + outputs].unsqueeze(1)
-            a = torch.baddbmm(biases, a, weights)
-            start = end + outputs
+        a, networks, start = batch.view(len(asked), most, NETWORK_INPUTS), self.networks[asked], 0
+        for rows, columns in ((NETWORK_INPUTS, self.hidden), (self.hidden, self.hidden), (self.hidden, 3)):
+            end = start + rows * columns
+            weights = networks[:, start:end].view(-1, rows, columns)
+            a = torch.baddbmm(networks[:, end : end + columns].unsqueeze(1), a, weights)
+            start = end + columns
             if start < networks.shape[1]:
                 a = torch.relu(a)
-        return a
+        out = a.reshape(-1, 3)[slot]
+        return torch.empty_like(out).index_copy(0, order, out)

@@ -62,8 +62,10 @@ class Rates:
         return self.first * (self.last / self.first) ** share
 
 
-def descend(optimiser: torch.optim.Optimizer, loss: Float[Tensor, ""]) -> float:
-    """Take one step down the gradient of a loss, and return the loss."""
+def descend(optimiser: torch.optim.Optimizer, loss: Float[Tensor, ""], *rates: float) -> float:
+    """Take one step down the gradient of a loss, each group of parameters at its rate, and return the loss."""
+    for group, rate in zip(optimiser.param_groups, rates, strict=True):
+        group["lr"] = rate
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
     optimiser.step()
@@ -109,10 +111,9 @@ class Stage:
             self.field = self.snapshot()
         self._count += 1
         rate = self._rates.at(share)
-        for group, factor in zip(self._optimiser.param_groups, (1.0, _NETWORK_RATE), strict=True):
-            group["lr"] = rate * factor
         query = partial(self.query, cell_jitter=_CELL_JITTER, generator=generator)
-        loss = descend(self._optimiser, _image_loss(query, self.field, rays, rng, _MOST_SAMPLES, self.query.device))
+        loss = _image_loss(query, self.field, rays, rng, _MOST_SAMPLES, self.query.device)
+        found = descend(self._optimiser, loss, rate, rate * _NETWORK_RATE)
         rows = self.query.rows
         with torch.no_grad():
             rows[:, 0].clamp_(-MOST_G / _FEATURE_UNITS[0], MOST_G / _FEATURE_UNITS[0])
@@ -121,7 +122,7 @@ class Stage:
             rows[0] = 0  # empty space is shared by all corners outside the shell and stays empty
             rows[0, 0] = EMPTY_G / _FEATURE_UNITS[0]
             self.query.ambient.clamp_(min=0)
-        return loss
+        return found
 
     def snapshot(self) -> KiloOSF:
         """Return the field as it is now."""
@@ -271,11 +272,9 @@ class NetworkStage:
             The loss.
         """
         self._count += 1
-        for group in self._optimiser.param_groups:
-            group["lr"] = self._rates.at(share) * min(1.0, self._count / _WARM_UP)
         network = self.network
         loss = _image_loss(network, self._proposal, rays, rng, _NETWORK_SAMPLES, network.device)
-        found = descend(self._optimiser, loss)
+        found = descend(self._optimiser, loss, self._rates.at(share) * min(1.0, self._count / _WARM_UP))
         if self._count % self._rebake == 0:
             self.update_proposal()
         return found

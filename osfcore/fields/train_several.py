@@ -84,35 +84,28 @@ def train_several(
     for one in settings:
         yield Progress(0, len(settings), f"Reading the images of {one.out.stem}")
         next(train(replace(one, device="cpu")))  # refuses what cannot work; of devices, the worker knows
-        training = _Training(one, _made_of(one))
+        # Plain JSON of everything that a field depends on, wherever set and output lie.
+        plain = {key: value for key, value in asdict(one).items() if key not in ("data", "out")}
+        images = [images.digest() for images in read_splits(one.data)]
+        training = _Training(one, {"settings": plain, "images": images})
         if not training.is_finished():
             missing.append(training)
     done, total = len(settings) - len(missing), len(settings)
     yield Progress(done, total, f"{done} of {total} trained")
     if executor is None:
-        yield from _one_by_one(missing, train, done, total)
+        for number, training in enumerate(missing, start=done):
+            for step in train(training.settings):
+                own = step.progress
+                yield Progress(number * own.total + own.done, total * own.total, f"{training.name}: {own.note}")
+            training.keep(*_read(training.settings.out))
         return
     for trained, last in enumerate(_side_by_side(missing, train, executor, threads, shares_disk), start=done + 1):
         yield Progress(trained, total, f"{trained} of {total} trained, {last}")
 
 
-def _made_of(settings: FieldSettings) -> dict[str, Any]:
-    """Return plain JSON of everything a field depends on, wherever set and output lie."""
-    plain = {key: value for key, value in asdict(settings).items() if key not in ("data", "out")}
-    return {"settings": plain, "images": [images.digest() for images in read_splits(settings.data)]}
-
-
 def _read(out: Path) -> tuple[bytes, dict[str, Any]]:
     """Read weights and metrics of a training."""
     return out.read_bytes(), json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
-
-
-def _one_by_one(missing: Sequence[_Training], train: TrainOne, done: int, total: int) -> Iterator[Progress]:
-    for number, training in enumerate(missing, start=done):
-        for step in train(training.settings):
-            own = step.progress
-            yield Progress(number * own.total + own.done, total * own.total, f"{training.name}: {own.note}")
-        training.keep(*_read(training.settings.out))
 
 
 def _side_by_side(

@@ -103,8 +103,6 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
     optimiser = torch.optim.Adam(model.parameters(), fused=True)
     source, pixels, half = RaySource(train), train.rgba[..., 0].size, TABLE_SIDE_M / 2
     for done in range(config.iterations):
-        for group in optimiser.param_groups:
-            group["lr"] = _RATES.at(done / config.iterations)
         rays = source.batch(rng.integers(pixels, size=config.rays))
         where, reach = _meet_plane(rays)
         ends = where, rays.lights, rays.rgb, reach < half - _EDGE_M, reach > half + _EDGE_M
@@ -112,7 +110,7 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
         loss = functional.mse_loss(model(places[on_table], lights[on_table]), truth[on_table])
         if beyond.any():
             loss = loss + functional.mse_loss(model.background.expand(int(beyond.sum()), 3), truth[beyond])
-        found = descend(optimiser, loss)
+        found = descend(optimiser, loss, _RATES.at(done / config.iterations))
         if done % _REPORT_EVERY == 0:
             yield Progress(done, config.iterations, f"{-10 * np.log10(found + 1e-10):.1f} dB on its own images")
     data = table_bytes(model.to_field())

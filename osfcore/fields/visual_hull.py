@@ -89,7 +89,7 @@ def carve(*sets: ImageSet, resolution: int = 32) -> Hull:
     meet it: the hull errs on the large side by about a cell.
     """
     views = [
-        _View.of(camera, rgba[..., 3] >= OPAQUE)
+        _View(camera, rgba[..., 3] >= OPAQUE, camera.intrinsics @ camera.T_world_camera.inverse().matrix()[:3])
         for images in sets
         for camera, rgba in zip(images.cameras, images.rgba, strict=True)
     ]
@@ -120,10 +120,6 @@ class _View:
     camera: Camera
     mask: Bool[np.ndarray, "h w"]
     P: Float[np.ndarray, "3 4"]
-
-    @staticmethod
-    def of(camera: Camera, mask: Bool[np.ndarray, "h w"]) -> _View:
-        return _View(camera, mask, camera.intrinsics @ camera.T_world_camera.inverse().matrix()[:3])
 
     def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return columns, rows [px] and depths; points behind the camera land outside of any image."""

@@ -6,12 +6,12 @@ the estimators and the dynamics model are arguments, so that each can be replace
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from osfcore.control.closed_loop import StageTimer
 from osfcore.control.estimators import Estimators, SceneModels
 from osfcore.control.events import ActionExecuted, Event, Finished, Looking, Observed, Planning, Stepped
 from osfcore.control.goal import GoalImage
@@ -64,16 +64,15 @@ def run_algorithm(
     planner = GaussianMPPI(models.dynamics.rollout, settings.plan)
     observation = world.observe(masks=True)
     yield Observed(0, observation)
-    seconds: dict[str, float] = {}
-    steps = _timed("first", estimators.first_frame(models.appearance, observation, rng), seconds)
-    estimate = yield from _look(0, steps)
+    timer = StageTimer()
+    steps = estimators.first_frame(models.appearance, observation, rng)
+    estimate = yield from _look(0, timer.steps("first", steps))
     for number in range(settings.steps):
         estimate = estimate.with_pusher(observation.pusher)
-        yield _stepped(number, settings, models, goal, estimate, seconds)
-        seconds, began = {}, time.perf_counter()
-        cost = ImageCost(models.appearance.together, goal.camera, goal.image, estimate.state.light, every=1)
-        round_ = planner.plan(estimate.state, cost, rng)
-        seconds["plan"] = time.perf_counter() - began
+        yield _stepped(number, settings, models, goal, estimate, timer.taken())
+        with timer.stage("plan"):
+            cost = ImageCost(models.appearance.together, goal.camera, goal.image, estimate.state.light, every=1)
+            round_ = planner.plan(estimate.state, cost, rng)
         yield Planning(number, round_)
         world.act(round_.actions[0])
         planner.shift()
@@ -81,9 +80,9 @@ def run_algorithm(
         observation = world.observe(masks=settings.has_masks)
         yield Observed(number + 1, observation)
         later = estimators.later_frame(models.appearance, observation, estimate.state, rng)
-        estimate = yield from _look(number + 1, _timed("estimate", later, seconds))
+        estimate = yield from _look(number + 1, timer.steps("estimate", later))
     estimate = estimate.with_pusher(observation.pusher)
-    yield _stepped(settings.steps, settings, models, goal, estimate, seconds)
+    yield _stepped(settings.steps, settings, models, goal, estimate, timer.taken())
     yield Finished(settings.steps, "out of steps", f"All {settings.steps} pushes are done.", estimate.state)
 
 
@@ -95,17 +94,6 @@ def _look(number: int, steps: Iterator[EstimateStep]) -> Iterator[Event]:  # ret
     if estimate is None:
         raise InvalidInput("last step of the estimator", "without an estimate", "one that holds it")
     return estimate
-
-
-def _timed(stage: str, steps: Iterator[EstimateStep], seconds: dict[str, float]) -> Iterator[EstimateStep]:
-    """Yield the steps, and add up the time that they take, without what is done between two of them [s]."""
-    while True:
-        began = time.perf_counter()
-        step = next(steps, None)
-        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - began
-        if step is None:
-            return
-        yield step
 
 
 def _stepped(

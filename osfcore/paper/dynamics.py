@@ -108,11 +108,6 @@ def node_features(scenes: Scenes, action: Float[Tensor, "B 3"]) -> Float[Tensor,
     return torch.cat([position, quaternion, actions], dim=2)
 
 
-def node_numbers(objects: Int[Tensor, "B N"]) -> Int[Tensor, "B A"]:
-    """Return the number of each node's embedding: the pusher first, then the objects as they are numbered."""
-    return functional.pad(objects, (1, 0), value=PUSHER)
-
-
 # The paper's graph network (eq. 7): propagation with one shared edge encoder and propagator.
 #
 # After Li et al. 2019, "Propagation networks for model-based control under partial observation", as the paper says.
@@ -220,7 +215,7 @@ def unroll(
         actions: velocities of the pusher [m/s].
         pusher: its centre before the first and after each action [m].
     """
-    scenes, numbers = start, node_numbers(number)
+    scenes, numbers = start, functional.pad(number, (1, 0), value=PUSHER)  # the pusher is the first node
     for step in range(actions.shape[1]):
         features = node_features(scenes, actions[:, step])
         change = network(features, numbers, adjacency(scenes, kappa))[:, 1:]

@@ -35,6 +35,7 @@ from osfcore.dynamics.train import (
     split_episodes,
     window_starts,
 )
+from osfcore.fields.train_osf import descend
 from osfcore.io.push_file import PushEpisode
 from osfcore.paper.dynamics import GraphNetwork, Scenes, network_bytes, squared_error, unroll
 from osfcore.progress import Progress
@@ -275,22 +276,15 @@ class _Run(PushTraining):
         return self.done % _MEASURE_EVERY == 0 or self.done == self.total
 
     def iterate(self) -> str:
-        for group in self._optimiser.param_groups:
-            group["lr"] = self._config.rate * share_of_rate(self.done, self.total)
-        loss = self._loss()
-        self._optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        self._optimiser.step()
-        self.done += 1
-        return f"loss {float(loss.detach()):.4f}; {self.note}"
-
-    def _loss(self) -> Tensor:
-        """Return the mean over three actions of the error that is summed across objects."""
         chosen = self.rng.integers(len(self._recording.starts), size=self._config.batch)
         pieces = windows(self._recording, chosen, self._device)
         scenes = unroll(self._network, pieces.number, pieces.kappa, pieces.start, pieces.action, pieces.pusher)
+        # The mean over three actions of the error that is summed across objects.
         losses = [squared_error(s, pieces.position[:, t], pieces.quaternion[:, t]) for t, s in enumerate(scenes)]
-        return torch.stack(losses).mean()
+        rate = self._config.rate * share_of_rate(self.done, self.total)
+        loss = descend(self._optimiser, torch.stack(losses).mean(), rate)
+        self.done += 1
+        return f"loss {loss:.4f}; {self.note}"
 
     def measured(self) -> tuple[Validation, GraphNetwork]:
         return validate(self._network, self._validation, self._device), self._network

@@ -103,14 +103,13 @@ class TinyDistillation:
             rng: draws the points.
             _generator: not needed here.
         """
-        for group in self._optimiser.param_groups:
-            group["lr"] = RATES.at(share)
         corner = self._corners[rng.integers(len(self._corners), size=_POINTS)]
         jitter = rng.uniform(-0.5, 0.5, corner.shape).astype(np.float32)
         points = self.start.field.origin + np.float32(self.start.field.voxel) * (corner + jitter)
         ray = rng.integers(len(rays.lights), size=_POINTS)
         drawn = (points, rays.lights[ray], rays.directions[ray])
-        return descend(self._optimiser, self.loss(*(torch.as_tensor(a, device=self.query.device) for a in drawn)))
+        loss = self.loss(*(torch.as_tensor(a, device=self.query.device) for a in drawn))
+        return descend(self._optimiser, loss, RATES.at(share))
 
     def loss(
         self, x: Float[Tensor, "S 3"], light: Float[Tensor, "S 3"], view: Float[Tensor, "S 3"]
