@@ -331,9 +331,9 @@ class TaskRunner:
             there = [n for n, name in enumerate(estimate.state.names) if name in case.truth.names]
             names = tuple(estimate.state.names[n] for n in there)
             state = replace(estimate.state, names=names, poses=estimate.state.poses[there])
-            errors = [tuple(one.tolist()) for one in pose_errors(state, case.truth, self._meshes(names))]
-            are_right = len(names) == len(estimate.state.names) and all(map(is_right, *errors))
-            score = BadScore(case.kind, "", estimate.reason, are_right, *errors, seconds)
+            shifts, turns = (tuple(one.tolist()) for one in pose_errors(state, case.truth, self._meshes(names)))
+            are_right = len(names) == len(estimate.state.names) and all(map(is_right, shifts, turns))
+            score = BadScore(case.kind, "", estimate.reason, are_right, shifts, turns, seconds)
         return TaskResult({"score": encode(score)}, self._compared(case.observation, estimate))
 
     def _timed(self, steps: Iterator[EstimateStep], frame: tasks.Frame) -> tuple[FrameScore, EstimatedState | None]:

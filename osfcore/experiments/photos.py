@@ -466,7 +466,8 @@ def _photo(config: EvaluatePhotos, scene: PhotoFolder) -> Photograph:
     if config.masks == "boxes":
         encoded = scene.encoded if scene.encoded.dtype == np.uint8 else (scene.encoded // 257).astype(np.uint8)
         marks = {name: box_and_click(mask) for name, mask in photo.masks.items()}
-        boxes, clicks = ({name: mark[k] for name, mark in marks.items()} for k in (0, 1))
+        boxes = {name: box for name, (box, _) in marks.items()}
+        clicks = {name: click for name, (_, click) in marks.items()}
         photo = photo.with_masks(propose_masks(np.ascontiguousarray(encoded), boxes, clicks))
     if config.mask_error_px:
         kernel = np.ones((2 * config.mask_error_px + 1,) * 2, np.uint8)

@@ -13,6 +13,7 @@ import itertools
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -61,9 +62,10 @@ def bind_material(stage: Usd.Stage, prim: UsdGeom.Mesh, mesh: trimesh.Trimesh, f
     surface.CreateInput("specularColor", _TYPES.Color3f).Set((0.0, 0.0, 0.0))
     surface.CreateInput(black, _TYPES.Color3f).Set((0.0, 0.0, 0.0))
     if isinstance(mesh.visual, TextureVisuals):
+        textured: Any = mesh.visual.material
         file = f"{_TEXTURES}/{prim.GetPath().name}.jpg"
         (folder / _TEXTURES).mkdir(exist_ok=True)
-        mesh.visual.material.baseColorTexture.save(folder / file, format="JPEG", quality="keep")
+        textured.baseColorTexture.save(folder / file, format="JPEG", quality="keep")
         reader = shader("UsdPrimvarReader_float2")
         reader.CreateInput("varname", _TYPES.String).Set("st")
         texture = shader("UsdUVTexture")
@@ -105,11 +107,12 @@ def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: trimesh.Trimesh, matrix: Fl
     prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     kind, primvars = UsdGeom.Tokens.vertex, UsdGeom.PrimvarsAPI(prim)
-    if isinstance(mesh.visual, TextureVisuals):
-        uv = Vt.Vec2fArray.FromNumpy(np.array(mesh.visual.uv, np.float32))
+    visual: Any = mesh.visual
+    if isinstance(visual, TextureVisuals):
+        uv = Vt.Vec2fArray.FromNumpy(np.array(visual.uv, np.float32))
         primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, kind).Set(uv)
     else:
-        colours = np.asarray(mesh.visual.vertex_colors, np.float32)[:, :3] / 255  # linear, as USD has them
+        colours = np.asarray(visual.vertex_colors, np.float32)[:, :3] / 255  # linear, as USD has them
         prim.CreateDisplayColorPrimvar(kind).Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colours)))
     return prim
 

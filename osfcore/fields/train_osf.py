@@ -583,7 +583,7 @@ class FieldStep:
 class Learner(Protocol):
     """One phase of a training between its steps."""
 
-    def step(self, rays: RayBatch, share: float, rng: np.random.Generator, generator: torch.Generator) -> float:
+    def step(self, rays: RayBatch, share: float, rng: np.random.Generator, generator: torch.Generator, /) -> float:
         """Take one step of descent when `share` in [0, 1] of the phase is done, and return the loss."""
         ...
 
@@ -591,7 +591,7 @@ class Learner(Protocol):
         """Return the field as it is now."""
         ...
 
-    def glance(self, images: ImageSet) -> Look | None:
+    def glance(self, images: ImageSet, /) -> Look | None:
         """Measure on a few of some images; None if there is nothing to show."""
         ...
 

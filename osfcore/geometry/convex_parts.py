@@ -1,6 +1,7 @@
 """Convex parts that together fill an object, for physics and the prediction of pushes."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -58,7 +59,7 @@ def _decomposed(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"
     import coacd
 
     coacd.set_log_level("off")
-    effort = {"preprocess_resolution": 30, "mcts_iterations": 60, "mcts_max_depth": 2}
+    effort: dict[str, Any] = {"preprocess_resolution": 30, "mcts_iterations": 60, "mcts_max_depth": 2}
     mesh = coacd.Mesh(vertices, faces)
     parts = coacd.run_coacd(mesh, threshold=_CONCAVITY, max_convex_hull=MAX_PARTS, seed=0, **effort)
     return [np.asarray(points) for points, _ in parts]

@@ -220,7 +220,7 @@ def _descend(views: Sequence[Sighting], theta: Theta, poses: Float[np.ndarray, "
         blocks = [by.reshape(-1, INTRINSICS + POSE) for _, by in at(x)]
         shared = np.concatenate([*(block[:, :INTRINSICS] for block in blocks), np.diag(pull)])
         own = block_diag(*(block[:, INTRINSICS:] for block in blocks), np.zeros((INTRINSICS, 0)))
-        return np.hstack([shared, own])
+        return np.hstack([shared, np.asarray(own)])
 
     start = np.concatenate([theta, poses.ravel()])
     how = {"method": "lm", "x_scale": "jac", "max_nfev": _MOST_STEPS}

@@ -25,7 +25,8 @@ Colours = Float[np.ndarray, "P C"]
 PerPixel = Float[np.ndarray, "P"]
 Columns = Float[np.ndarray, "P K"]
 Jacobian = Float[np.ndarray, "P 3 count"]
-Light, Lights = Float[np.ndarray, "K"], Float[np.ndarray, "3 K"]  # of K terms: of one colour, and of all
+Light = Float[np.ndarray, "K"]  # of K terms, in one colour
+Lights = Float[np.ndarray, "3 K"]
 
 # The direction toward a lamp, from the shading of surfaces whose normals and albedo are known.
 #
@@ -329,9 +330,12 @@ class LitPixels:
                          self.owner[some], self.view[some], self.shadows)  # fmt: skip
 
 
-def _joined(parts: Sequence[tuple[Any, ...]]) -> list[Vectors]:
+def _joined(parts: Sequence[tuple[Any, ...]]) -> PixelColumns:
     """Concatenate the first four columns of parts: radiance, albedo, points and normals."""
-    return [np.concatenate([np.zeros((0, 3)), *(part[k] for part in parts)]) for k in range(4)]
+    radiance, albedo, points, normals = (
+        np.concatenate([np.zeros((0, 3)), *(part[k] for part in parts)]) for k in range(4)
+    )
+    return radiance, albedo, points, normals
 
 
 def object_pixels(photo: Photograph, found: PhotoObject, surfels: Surfels) -> PixelColumns:
@@ -355,7 +359,8 @@ def _facing_pixels(photo: Photograph, found: PhotoObject, surfels: Surfels) -> P
     try:
         columns = object_pixels(photo, found, surfels)
     except InvalidInput:  # a tiny mask in one of several views
-        return (np.zeros((0, 3)),) * 4
+        none = np.zeros((0, 3))
+        return none, none, none, none
     to_camera = photo.T_world_camera.position - columns[2]
     cosine = np.sum(columns[3] * to_camera, axis=1) / np.linalg.norm(to_camera, axis=1)
     kept = np.flatnonzero(cosine > _SEEN)

@@ -530,7 +530,8 @@ class TablePrior:
 
 
 LossKind = Literal["all", "iou"]
-Indices, Depths = Int32[np.ndarray, "B h w"], Float32[np.ndarray, "B h w"]
+Indices = Int32[np.ndarray, "B h w"]
+Depths = Float32[np.ndarray, "B h w"]
 _RESIDUAL, _CORRELATION, _TABLE = 1.0, 0.5, 1e-3  # weights
 _LEAST_COMPARED = 0.3  # of the mask's plain pixels must be drawn for colours to count
 _HALF_SIDE = 0.7  # of a surfel, in spacings

@@ -79,7 +79,9 @@ def pack(fields: Sequence[KiloOSF]) -> Packed:
         shapes=np.array([[*f.index.shape, *f.macro.shape, *f.cells.shape] for f in fields], np.int64),
         scales=np.array([[*f.origin, f.voxel] for f in fields], np.float32),
         # One voxel more: between an occupied corner and an empty one there is density too.
-        extents=np.array([(f.extent + f.voxel * np.float32([[-1], [1]])).reshape(-1) for f in fields], np.float32),
+        extents=np.array(
+            [(f.extent + f.voxel * np.array([[-1], [1]], np.float32)).reshape(-1) for f in fields], np.float32
+        ),
         ambient=np.array([f.ambient for f in fields], np.float32),
         hidden=fields[0].hidden,
         parameters=fields[0].networks.shape[1],

@@ -204,10 +204,10 @@ class OutlinedWorld:
         marked = without_cameras(seen, unmarked)
         pictures = [to_uint8(srgb_of_linear(image)) for image in marked.images]
         pairs = zip(marked.cameras, pictures, strict=True)
-        masks = []
+        found = []
         for camera, picture in pairs:  # a click in a box's middle marks the object, and background of the others
             boxes = self._boxes[camera.name]
             clicks = {name: np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]) for name, (x0, y0, x1, y1) in boxes.items()}
-            found = propose_masks(picture, boxes, clicks)
-            masks.append([found[name] for name in seen.names])
-        return replace(marked, masks=np.array(masks))
+            masks_of = propose_masks(picture, boxes, clicks)
+            found.append([masks_of[name] for name in seen.names])
+        return replace(marked, masks=np.array(found))
