@@ -49,6 +49,9 @@ class AssetLibrary:
 
     root: Path
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "root", Path(self.root))  # a string is a path, too
+
     def names(self) -> tuple[str, ...]:
         """Return the names of all objects that can be loaded, sorted."""
         if not self.root.is_dir():

@@ -42,6 +42,7 @@ def test_what_is_written_comes_back(shelf, asset):
     assert (back.mesh.vertices.dtype, back.mesh.faces.dtype) == (np.float32, np.int32)
     np.testing.assert_allclose(shelf.size_m("toy"), asset.size_m, atol=1e-6)
     assert (shelf.source("toy"), shelf.names()) == ("a test", ("toy",))
+    assert AssetLibrary(str(shelf.root)) == shelf  # a string will do
     (shelf.root / "toy" / "texture.png").unlink()  # the shape alone does without
     assert_same(shelf.load_geometry("toy"), ObjectGeometry(back.mesh.vertices, back.mesh.faces, back.parts))
 
