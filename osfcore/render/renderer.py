@@ -78,14 +78,17 @@ def pack(fields: Sequence[KiloOSF]) -> Packed:
         starts=starts,
         shapes=np.array([[*f.index.shape, *f.macro.shape, *f.cells.shape] for f in fields], np.int64),
         scales=np.array([[*f.origin, f.voxel] for f in fields], np.float32),
-        # One voxel more: between an occupied corner and an empty one there is density too.
-        extents=np.array(
-            [(f.extent + f.voxel * np.array([[-1], [1]], np.float32)).reshape(-1) for f in fields], np.float32
-        ),
+        extents=np.array([_reach(f).reshape(-1) for f in fields], np.float32),
         ambient=np.array([f.ambient for f in fields], np.float32),
         hidden=fields[0].hidden,
         parameters=fields[0].networks.shape[1],
     )
+
+
+def _reach(field: KiloOSF) -> np.ndarray:
+    """Return the occupied part and one voxel more: between an occupied corner and an empty one there is density too."""
+    low, high = field.extent
+    return np.stack([low - field.voxel, high + field.voxel])
 
 
 # Near lamps for the compiled renderer: their places in every object's coordinates, and where their shadows fall.
