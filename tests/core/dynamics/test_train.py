@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from osfcore.dynamics.rollout import load_shapes
 from osfcore.dynamics.shapes import ShapeTable
 from osfcore.dynamics.train import (
     Optimizers,
+    PushTraining,
     TrainDynamics,
     batch,
     distance,
@@ -185,6 +186,45 @@ def test_a_killed_run_goes_on_unless_its_checkpoint_does_not_fit_and_ends_with_t
     assert all(torch.equal(a[name], b[name]) for name in a)
     assert metrics(settings) == metrics(whole[0])
     assert not checkpoint.exists()
+
+
+@dataclass(frozen=True)
+class Size:
+    mm_4: float
+    deg_4: float = 0.0
+
+
+class Growing(PushTraining):
+    """A number that grows by one in each step, measured after every eighth one; the smaller the better."""
+
+    measurement, score = Size, "mm_4"
+
+    def __init__(self, out):
+        self.number = torch.nn.Linear(1, 1, bias=False)
+        torch.nn.init.zeros_(self.number.weight)
+        super().__init__(self.number, {"number": self.number}, "growing", out=out, total=50, patience=2, seed=0)
+
+    def iterate(self):
+        with torch.no_grad():
+            self.number.weight += 1
+        self.done += 1
+        return self.note
+
+    def is_due(self):
+        return self.done % 8 == 0
+
+    def measured(self):
+        return Size(self.number.weight.item()), self.number
+
+    def described(self):
+        return repr(self.number.weight.item()).encode(), {"iterations": self.done}
+
+
+def test_a_run_ends_when_nothing_gets_better_and_the_best_weights_are_written(tmp_path):
+    *_, last = Growing(tmp_path / "a.bin").run()
+    assert float((tmp_path / "a.bin").read_text()) == 8
+    assert json.loads((tmp_path / "a.json").read_text())["iterations"] == 24
+    assert (last.done, last.total) == (50, 50)
 
 
 @pytest.mark.parametrize("lost", ["descent", "best", "rng"])
