@@ -620,6 +620,7 @@ class FieldTraining(ABC):
     ) -> None:  # fmt: skip
         self._settings, self._pace, self.device = settings, pace, device
         self.train, self.test, self._source = train, test, RaySource(train)
+        self._pixels = self._source.silhouette_pixels()
         self.rng = np.random.default_rng(settings.seed)
         self._generator = torch.Generator(device).manual_seed(settings.seed)
         self._clock: dict[str, Any] = {"seconds": 0.0, "steps": 0, "looked_at": 0.0, "psnr": None}
@@ -668,10 +669,10 @@ class FieldTraining(ABC):
         yield self._finish(learner)
 
     def _descend(self, name: str, learner: Learner, start: float, end: float) -> Iterator[FieldStep]:
-        clock, already, pixels = self._pace.clock, self._clock["seconds"], self._source.silhouette_pixels()
+        clock, already = self._pace.clock, self._clock["seconds"]
         began = reported = saved = clock()
         while (share := self._share()) < end:
-            rays = self._source.batch(self.rng.choice(pixels, self.rays(name)))
+            rays = self._source.batch(self.rng.choice(self._pixels, self.rays(name)))
             learner.step(rays, (share - start) / (end - start), self.rng, self._generator)
             now = clock()
             self._clock |= {"steps": self._clock["steps"] + 1, "seconds": already + now - began}
