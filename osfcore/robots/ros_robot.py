@@ -246,7 +246,8 @@ class Rosbridge:
 _TWIST_EVERY_S = 0.05  # more often than any controller gives up on its commands
 _PICTURES_EVERY_MS = 50
 _FRESH = 2  # pictures to wait for: the first may have been exposed before it was asked for
-_TRANSFORMS, _TRANSFORMS_KEPT = ("/tf_static", "/tf"), 200
+_MOVING, _TRANSFORMS_KEPT = "/tf", 200
+_TRANSFORMS = ("/tf_static", _MOVING)
 _HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # ROS has pixel centres at whole numbers
 
 
@@ -350,6 +351,7 @@ class RosRobot:
             CorruptFile, InvalidInput: if they are malformed.
         """
         pictures = self.pictures()
+        self._wait({_MOVING: self._bridge.count(_MOVING) + 1})  # the pusher's place is no older than the pictures
         pusher = self._tree().pose(self._topics.pusher, self._topics.table).position
         return observation_of(self._cameras, pictures, self._names, pusher, time.monotonic() - self._began)
 

@@ -62,6 +62,14 @@ def test_pictures_are_newer_than_the_question(robot, stand_in):
     assert not stand_in.silent
 
 
+def test_a_pusher_whose_place_is_no_longer_published_is_not_taken_to_stand_still(stand_in):
+    with contextlib.closing(short(stand_in)) as robot:
+        robot.observe()
+        stand_in.silent.add("/tf")
+        with pytest.raises(RobotRefused, check=about("/tf")):
+            robot.observe()
+
+
 def test_velocities_are_sent_in_the_frame_of_the_table_once_it_is_started_until_they_are_over(robot, stand_in):
     with pytest.raises(RobotRefused):
         robot.act(LEFT)
