@@ -30,19 +30,25 @@ NAMES = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_ge
 NO_SYMMETRIES = defaultdict(lambda: Symmetry("none", reason="label"))
 
 
+def shorten(patch):
+    """Let episodes be short and of few objects."""
+    patch.setattr(dynamics, "_STEPS", 34)
+    patch.setattr(dynamics, "COUNTS", (2, 3))
+    patch.setattr(bench_dynamics, "SEQUENCES", 10)
+
+
 @pytest.fixture(scope="module")
 def evaluated(library, tmp_path_factory):
-    """Short episodes of few objects, with our predictions of them."""
     config = dynamics.EvaluateDynamics(tmp_path_factory.mktemp("dynamics"), tasks=1, seed=4, names=NAMES)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dynamics, "_STEPS", 34)
-        patch.setattr(dynamics, "COUNTS", (2, 3))
-        patch.setattr(bench_dynamics, "SEQUENCES", 10)
-        yield config, list(dynamics.evaluate_dynamics(config, FieldLibrary(None), library))
+        shorten(patch)
+        steps = list(dynamics.evaluate_dynamics(config, FieldLibrary(None), library))
+    return config, steps
 
 
 @pytest.mark.slow
-def test_an_evaluation_collects_its_episodes_once(evaluated, library):
+def test_an_evaluation_collects_its_episodes_once(evaluated, library, monkeypatch):
+    shorten(monkeypatch)
     config, steps = evaluated
     folder, report = config.folder, steps[-1].report
     assert steps[-1].done == steps[-1].total
@@ -59,7 +65,8 @@ def test_an_evaluation_collects_its_episodes_once(evaluated, library):
 
 
 @pytest.mark.slow
-def test_the_papers_model_is_measured_on_the_same_episodes(evaluated, library):
+def test_the_papers_model_is_measured_on_the_same_episodes(evaluated, library, monkeypatch):
+    shorten(monkeypatch)
     config, steps = evaluated
     folder, ours = config.folder, steps[-1].report
     kept = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}

@@ -39,16 +39,21 @@ def write_weights(folder):
     write_fitvid(folder / "data" / "fitvid.safetensors", FitVidModel(FitVidSettings(16, 1, 2, 2, 1)).eval())
 
 
+def predict_grey(patch):
+    """Let grey take the place of predictions that take long; few steps push nothing far."""
+    patch.setattr(tasks, "PUSHED_M", 0.0)
+    patch.setattr(videos, "predict_through_fields", lambda video, *_: np.full_like(video.frames, 0.5))
+
+
 @pytest.fixture(scope="module")
 def compared(library, tmp_path_factory):
-    """A comparison in which grey takes the place of predictions that take long."""
     folder = tmp_path_factory.mktemp("video")
     write_weights(folder)
     asked = config(folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tasks, "PUSHED_M", 0.0)
-        patch.setattr(videos, "predict_through_fields", lambda video, *_: np.full_like(video.frames, 0.5))
-        yield asked, list(videos.compare_videos(asked, FieldLibrary(None), library))
+        predict_grey(patch)
+        steps = list(videos.compare_videos(asked, FieldLibrary(None), library))
+    return asked, steps
 
 
 @pytest.mark.slow
@@ -74,6 +79,7 @@ def test_an_episode_is_predicted_by_all_methods(compared):
 
 @pytest.mark.slow
 def test_what_was_predicted_is_taken_over_method_by_method(compared, library, monkeypatch):
+    predict_grey(monkeypatch)
     asked, steps = compared
     measured, real = [], videos.simulate_video
     monkeypatch.setattr(videos, "simulate_video", lambda *given: measured.append(given) or real(*given))
@@ -112,7 +118,7 @@ DRAW = draw_scene(SOLIDS, 2, 3, 0, Stream.VIDEO_SCENE)
 def video(library):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tasks, "PUSHED_M", 0.0)  # few steps push nothing far
-        yield videos.simulate_video(DRAW, library, STEPS, SIZE)
+        return videos.simulate_video(DRAW, library, STEPS, SIZE)
 
 
 @pytest.fixture
