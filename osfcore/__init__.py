@@ -4,7 +4,6 @@ A map of the rooms, each importing only from those above it:
 
     geometry     poses, rotations, cameras, light, scene states, rollouts, convex parts
     io           file formats with their checks: scenes, states, observations, image sets, pushes, rollouts
-    client       the service over REST, in the core's own types
     objects      the catalogue of objects, their meshes, and the library on disk
     metrics      errors of poses and images, success of rearrangements
     fields       neural scattering functions (OSF, KiloOSF), the table's field, and their training
@@ -14,11 +13,9 @@ A map of the rooms, each importing only from those above it:
     dynamics     what a push does: contact graph and propagation network
     planning     MPPI, costs, push primitives, path planning
     control      Algorithm 1 of the paper as a generator of events over a `World`
-    robots       robots over HTTP and ROS 2 as worlds; limits and a stop around any world
     paper        the paper's dynamics model as published, to compare ours with
     world        the simulated tabletop (PyBullet) and data collection
-    export       scenes and fields as files that other programs open: binary glTF, USD, Gaussian splats
-    environments the tabletop as a Gymnasium environment, for programs that learn
+    contrib      beyond the paper: files of others, robots, a Gymnasium environment, a client of the service
     inspection   checks of files, and pictures of how they were understood
     experiments  evaluations and benchmarks; only the command line imports it
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from osfcore.export.lerobot import LeRobotEpisode, instruction, write_dataset
+from osfcore.contrib.export.lerobot import LeRobotEpisode, instruction, write_dataset
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "examples" / "lerobot_env_osf"
@@ -57,7 +57,7 @@ def test_gymnasium_finds_nothing_wrong(made):
 
 def test_it_observes_what_the_tabletop_does(made, data_dir):
     ours = gymnasium.make(
-        "osfcore.environments:OSFTabletop-v0", data_dir=data_dir, names=tuple(NAMES), objects=2, obs="both",
+        "osfcore.contrib.tabletop_env:OSFTabletop-v0", data_dir=data_dir, names=tuple(NAMES), objects=2, obs="both",
         image_side=32,
     )  # fmt: skip
     observed, info = ours.reset(seed=4)

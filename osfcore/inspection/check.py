@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from osfcore.contrib.bop import BopImage, is_bop_scene, read_images, result_images
 from osfcore.errors import CorruptFile, InvalidInput, shown
 from osfcore.fields.kiloosf import FORMAT as FIELD_FORMAT
 from osfcore.fields.kiloosf import read_field, tensor_format
@@ -35,7 +36,6 @@ from osfcore.io.image_set import read_image_set, read_splits
 from osfcore.io.observation_file import OBSERVATION_FILE, is_observation, read_observation
 from osfcore.io.output_paths import check_place
 from osfcore.io.scene_file import actions_from_json, estimated_from_json, is_estimated, scene_from_json
-from osfcore.photo.bop import BopImage, is_bop_scene, read_images, result_images
 
 _SHARE = 0.5  # of the objects whose annotated place must fit their masks
 _LEAST_PIXELS = 20  # of a mask that counts

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from osfcore.contrib.bop import NAMES
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.io.image_file import to_uint8, write_png
-from osfcore.photo.bop import NAMES
 
 
 def write_bop_scene(folder: Path, observation: Observation, state: SceneState, centres=None) -> Path:

@@ -132,10 +132,10 @@ class PhotoEstimate:
     def run(self) -> dict[str, Any]:
         """Estimate; the result is what the file holds."""
         from app.cli.commands.photo_inputs import Asked, read_inputs
+        from osfcore.contrib.bop import PoseChoice
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.files import write_json
         from osfcore.io.json_codec import encode
-        from osfcore.photo.bop import PoseChoice
         from osfcore.photo.poses import PhotoConfig, PhotoModels, estimate_photo
         from osfcore.photo.summary import summarised
         from osfcore.random_streams import Stream, stream_rng

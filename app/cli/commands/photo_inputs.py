@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from osfcore.contrib.bop import PoseChoice, read_masks, read_poses
 from osfcore.errors import InvalidInput, UnknownName, shown
 from osfcore.geometry.poses import Pose
-from osfcore.photo.bop import PoseChoice, read_masks, read_poses
 from osfcore.photo.calibration import KnownCamera, read_camera
 from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
 from osfcore.photo.segmentation import Box, propose_mask

@@ -16,8 +16,7 @@ from PIL import Image, ImageOps
 
 from app.episodes.file_names import GOAL_FILE, REPORT_FILE
 from app.episodes.finished import FinishedEpisode, read_episode
-from osfcore.errors import CorruptFile, InvalidInput, OsfError
-from osfcore.export.lerobot import (
+from osfcore.contrib.export.lerobot import (
     GOAL_IMAGE,
     DatasetSize,
     LeRobotEpisode,
@@ -26,6 +25,7 @@ from osfcore.export.lerobot import (
     instruction,
     write_dataset,
 )
+from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.states import pose_rows
 from osfcore.io.files import reading_png

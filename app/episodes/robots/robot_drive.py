@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 
 from app.episodes.robots.robot_record import RobotRecord
+from osfcore.contrib.robots.connect import connect
+from osfcore.contrib.robots.guarded_world import CameraBoxes, GuardedWorld, OutlinedWorld
+from osfcore.contrib.robots.robot import RobotDescription, SafetyLimits
 from osfcore.control.closed_loop import Episode
 from osfcore.control.estimators import load_scene_models
 from osfcore.control.events import EpisodeSettings, Event
@@ -23,9 +26,6 @@ from osfcore.geometry.workspace import PUSHER_RADIUS_M
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.photo.read_photograph import read_photograph
 from osfcore.random_streams import Stream, stream_rng
-from osfcore.robots.connect import connect
-from osfcore.robots.guarded_world import CameraBoxes, GuardedWorld, OutlinedWorld
-from osfcore.robots.robot import RobotDescription, SafetyLimits
 
 _RADIUS_DIFFERS_M = 0.001  # more is said
 

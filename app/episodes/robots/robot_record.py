@@ -15,13 +15,13 @@ from app.episodes.file_names import FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, VIDEO
 from app.episodes.frames import frame, read_frames, write_video
 from app.episodes.record import by_name, goal_to_json
 from app.episodes.robots.stopped_report import STOPPED
+from osfcore.contrib.robots.guarded_world import GuardedWorld
 from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.geometry.states import Observation
 from osfcore.io.files import write_json
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.scene_file import estimated_to_json
 from osfcore.metrics.image_errors import ssim
-from osfcore.robots.guarded_world import GuardedWorld
 
 
 class RobotRecord:

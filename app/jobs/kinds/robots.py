@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from app.episodes.file_names import GOAL_FILE
 from app.jobs.job import INPUTS
 from app.jobs.kinds.episodes import settings_of, use_one_thread
-from osfcore.robots.robot import ConnectionLost, SafetyLimits
+from osfcore.contrib.robots.robot import ConnectionLost, SafetyLimits
 
 if TYPE_CHECKING:
     from app.episodes.robots.robot_drive import DriveOrder, RobotDrive

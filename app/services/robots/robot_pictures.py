@@ -11,11 +11,11 @@ from pathlib import Path
 import cv2
 
 from app.episodes.robots.camera_files import CameraPicture, read_picture
+from osfcore.contrib.robots.http_robot import KEPT_SIDE
 from osfcore.errors import OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import encode_jpeg
 from osfcore.photo.read_photograph import read_photograph
-from osfcore.robots.http_robot import KEPT_SIDE
 
 FRESH_S = 1.0  # nobody looks again before
 

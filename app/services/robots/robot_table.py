@@ -22,10 +22,10 @@ from app.services.robots.robot_pictures import RobotPictures
 from app.services.runner import Runner
 from app.services.service_settings import Settings
 from app.storage.database import CannotStore
+from osfcore.contrib.robots.connect import check_address, connect
+from osfcore.contrib.robots.http_robot import HttpRobot
+from osfcore.contrib.robots.robot import RobotDescription, SafetyLimits
 from osfcore.errors import InvalidInput, OsfError, UnknownName
-from osfcore.robots.connect import check_address, connect
-from osfcore.robots.http_robot import HttpRobot
-from osfcore.robots.robot import RobotDescription, SafetyLimits
 
 KIND = "robot"
 LEASE_S = 3.0  # without a word from the page that let the robot move

@@ -6,7 +6,7 @@ from typing import Any
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from osfcore.export.lerobot import ACTION, ENVIRONMENT, GOAL_IMAGE, IMAGES, STATE, image_name
+from osfcore.contrib.export.lerobot import ACTION, ENVIRONMENT, GOAL_IMAGE, IMAGES, STATE, image_name
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.workspace import STEP_S
 

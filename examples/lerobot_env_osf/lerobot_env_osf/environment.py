@@ -5,9 +5,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from osfcore.environments import TABLETOP_ID  # registers what is made below
-from osfcore.environments.tabletop_env import TabletopEnv
-from osfcore.export.lerobot import GOAL_IMAGE, environment_state, image_name, instruction
+from osfcore.contrib.tabletop_env import TABLETOP_ID  # registers what is made below
+from osfcore.contrib.tabletop_env import TabletopEnv
+from osfcore.contrib.export.lerobot import GOAL_IMAGE, environment_state, image_name, instruction
 from osfcore.geometry.cameras import default_cameras
 
 

@@ -15,8 +15,8 @@ from app.episodes.file_names import GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
 from app.episodes.finished import NoEpisode
 from app.episodes.lerobot.export import NothingPushed, write_lerobot
 from app.episodes.trajectory import Trajectory, write_trajectory
+from osfcore.contrib.export.lerobot import DatasetSize
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.export.lerobot import DatasetSize
 from osfcore.extras import MissingExtra
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light

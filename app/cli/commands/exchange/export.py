@@ -42,9 +42,9 @@ class ExportScene:
 
         suffix = _check_out(self.out, ".glb", ".usdz")
         if suffix == ".glb":
-            from osfcore.export.meshes import scene_glb as export
+            from osfcore.contrib.export.meshes import scene_glb as export
         else:
-            from osfcore.export.usd import scene_usdz as export
+            from osfcore.contrib.export.usd import scene_usdz as export
         scene = read_scene(self.scene)
         library, fields = AssetLibrary(self.data_dir / "objects"), FieldLibrary(self.data_dir)
         scanned = [name for name in scene.state.names if library.has(name) and not self.fields]
@@ -78,9 +78,9 @@ class ExportField:
         """Export; the result tells what the colours are."""
         suffix = _check_out(self.out, ".glb", ".usdz", ".usdc")
         if suffix == ".glb":
-            from osfcore.export.meshes import field_glb as export
+            from osfcore.contrib.export.meshes import field_glb as export
         else:
-            from osfcore.export.usd import field_usd
+            from osfcore.contrib.export.usd import field_usd
 
             export = partial(field_usd, is_packed=suffix == ".usdz")
         light, shape = None if self.light is None else _light(self.light), _field(self.name, self.data_dir)
@@ -108,7 +108,7 @@ class ExportSplats:
 
     def run(self) -> dict[str, Any]:
         """Export; the result tells how many Gaussians there are."""
-        from osfcore.export.splats import field_splats, splats_ply
+        from osfcore.contrib.export.splats import field_splats, splats_ply
 
         _check_out(self.out, ".ply")
         splats = field_splats(_field(self.name, self.data_dir), _light(self.light))

@@ -30,11 +30,11 @@ class ExportPoses:
 
     def run(self) -> dict[str, Any]:
         """Export; the result tells how many poses there are."""
+        from osfcore.contrib.bop import bop_results
         from osfcore.io.files import write_atomically
         from osfcore.io.observation_file import read_observation
         from osfcore.io.output_paths import check_place
         from osfcore.io.scene_file import read_estimated
-        from osfcore.photo.bop import bop_results
 
         if self.out.suffix.lower() != ".csv":
             raise InvalidInput("output file", self.out, "a path that ends in .csv")

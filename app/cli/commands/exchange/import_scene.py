@@ -41,10 +41,10 @@ class Import:
 
     def run(self) -> dict[str, Any]:
         """Import; the result tells images and objects, and which objects were left out."""
+        from osfcore.contrib.bop import BopChoice, read_bop_scene
         from osfcore.fields.field_library import FieldLibrary
         from osfcore.io.files import folder_at_once, write_json
         from osfcore.io.observation_file import write_observation
-        from osfcore.photo.bop import BopChoice, read_bop_scene
 
         out = self.out.absolute()
         if out.exists() and (not out.is_dir() or any(out.iterdir())):

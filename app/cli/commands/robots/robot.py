@@ -15,9 +15,9 @@ from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
     from app.episodes.robots.robot_drive import RobotDrive
+    from osfcore.contrib.robots.guarded_world import CameraBoxes
+    from osfcore.contrib.robots.robot import Robot, RobotDescription, SafetyLimits
     from osfcore.geometry.states import Observation
-    from osfcore.robots.guarded_world import CameraBoxes
-    from osfcore.robots.robot import Robot, RobotDescription, SafetyLimits
 
 _LOOKS = 3
 _FORM = "CAMERA:NAME:LEFT,TOP,RIGHT,BOTTOM, such as left:025_mug:120,80,260,210"
@@ -37,8 +37,8 @@ class RobotCheck:
     def run(self) -> dict[str, Any]:
         """Look some times; the result tells cameras, limits and how long a look takes."""
         from app.episodes.robots.robot_drive import doubts_about
+        from osfcore.contrib.robots.connect import connect
         from osfcore.io.output_paths import check_place
-        from osfcore.robots.connect import connect
 
         if self.out is not None:
             check_place(self.out / "overlay.png")
@@ -144,7 +144,7 @@ class RobotDriveCommand:
         )  # fmt: skip
 
     def _limits(self) -> SafetyLimits:
-        from osfcore.robots.robot import SafetyLimits
+        from osfcore.contrib.robots.robot import SafetyLimits
 
         return SafetyLimits(top_speed_m_s=self.top_speed, **({} if self.box is None else {"box": self.box}))
 

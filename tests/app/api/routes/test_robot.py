@@ -14,11 +14,11 @@ from app.jobs.clock import JobClock
 from app.processes.messages.job_messages import JobCancelled, JobStep
 from app.services import runner
 from app.services.robots import robot_table
+from osfcore.contrib.robots.robot import ConnectionLost
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.states import Observation
 from osfcore.io.files import write_json
 from osfcore.io.scene_file import camera_to_json
-from osfcore.robots.robot import ConnectionLost
 from tests.app.conftest import running, until
 from tests.live import free_port
 from tests.support.robots import NAMES, example, noted, serving, simulated

@@ -86,7 +86,7 @@ def test_the_same_comes_as_usd(rendered, field_file, tmp_path, capsys, data_dir)
 
 def test_usd_is_refused_in_words_where_its_library_is_missing(field_file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None)
-    for module in [name for name in sys.modules if name.startswith("osfcore.export.usd")]:
+    for module in [name for name in sys.modules if name.startswith("osfcore.contrib.export.usd")]:
         monkeypatch.delitem(sys.modules, module)
     assert main(["export", "field", str(field_file), "--out", str(tmp_path / "solid.usdz")]) == 1
     assert "A USD file needs pxr, which is not installed; get it with: pip install 'osf-manipulation[usd]'." in (

@@ -9,9 +9,9 @@ from app.jobs.context import JobControl
 from app.jobs.job import INPUTS
 from app.jobs.worker import run_job
 from app.processes.messages.job_messages import CancelJob, ChangeJob, JobCancelled, RunJob
+from osfcore.contrib.robots.connect import connect
+from osfcore.contrib.robots.robot import ConnectionLost, RobotRefused, RobotStopped
 from osfcore.io.image_file import write_png
-from osfcore.robots.connect import connect
-from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped
 from tests.support.robots import NAMES, example, serving, simulated, tell_truth, toward_middle, until
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
+from osfcore.contrib.robots.connect import connect
+from osfcore.contrib.robots.robot import RobotRefused
 from osfcore.control import estimators
 from osfcore.io.image_file import write_png
-from osfcore.robots.connect import connect
-from osfcore.robots.robot import RobotRefused
 from tests.live import free_port
 from tests.support.robots import NAMES, example, serving, simulated, tell_truth, toward_middle, until
 from tests.support.ros_robots import StandIn

@@ -20,13 +20,13 @@ from pydantic import Field, FiniteFloat
 from websockets.exceptions import ConnectionClosed, InvalidURI, WebSocketException
 from websockets.sync.client import connect
 
+from osfcore.contrib.robots.http_robot import SentCamera, observation_of
+from osfcore.contrib.robots.robot import ConnectionLost, RobotDescription, RobotRefused, SafetyLimits
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName
 from osfcore.geometry.poses import Pose, unit_quaternion
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import STEP_S, check_action
 from osfcore.io.json_codec import Entry, decode
-from osfcore.robots.http_robot import SentCamera, observation_of
-from osfcore.robots.robot import ConnectionLost, RobotDescription, RobotRefused, SafetyLimits
 
 # Poses of frames from ROS's transforms (tf2_msgs/TFMessage).
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from urllib.parse import SplitResult, parse_qsl, urlsplit
 
+from osfcore.contrib.robots.http_robot import HttpRobot
+from osfcore.contrib.robots.robot import Robot, SafetyLimits
 from osfcore.errors import InvalidInput, check_known
 from osfcore.extras import need
-from osfcore.robots.http_robot import HttpRobot
-from osfcore.robots.robot import Robot, SafetyLimits
 
 FORMS = "http://HOST:PORT, https://HOST:PORT or ros://HOST:9090?cameras=NAME,NAME"
 _ROS_PORT = 9090
@@ -33,7 +33,7 @@ def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None =
     if parts.scheme != "ros":
         return HttpRobot(url, names)
     need("ros", "A robot under ROS")
-    from osfcore.robots.ros_robot import RosNames, RosRobot
+    from osfcore.contrib.robots.ros_robot import RosNames, RosRobot
 
     asked = dict(parse_qsl(parts.query))
     check_known("part of a robot's address", asked, _ROS_NAMES)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from osfcore.export.meshes import field_glb, glb, scene_glb
+from osfcore.contrib.export.meshes import field_glb, glb, scene_glb
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose

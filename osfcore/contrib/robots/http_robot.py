@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from pydantic import Field, FiniteFloat
 
+from osfcore.contrib.robots.robot import ConnectionLost, RobotDescription, RobotRefused, SafetyLimits
 from osfcore.errors import InvalidInput, OsfError, shown
 from osfcore.estimation.camera_response import linear_from_encoded
 from osfcore.geometry.cameras import Camera
@@ -26,7 +27,6 @@ from osfcore.io.json_codec import Entry, Vector4, decode
 from osfcore.io.scene_file import CameraJson, PointJson, rigid_pose
 from osfcore.photo.read_photograph import KEPT_SIDE as MOST_SIDE
 from osfcore.photo.read_photograph import read_photograph
-from osfcore.robots.robot import ConnectionLost, RobotDescription, RobotRefused, SafetyLimits
 
 # From encoded pictures of a robot's cameras to linear radiance of moderate size, as an `Observation` holds it.
 

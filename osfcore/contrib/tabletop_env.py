@@ -1,6 +1,16 @@
-"""Rearrangement of a simulated tabletop as a Gymnasium environment.
+"""Rearrangement of a simulated tabletop as a Gymnasium environment, registered when this module is imported.
 
 Each episode is a random rearrangement task (`osfcore.world.tasks`): a scene at rest, and its goal.
+
+    import gymnasium
+    import osfcore.contrib.tabletop_env
+    env = gymnasium.make("OSFTabletop-v0")
+
+or in one call `gymnasium.make("osfcore.contrib.tabletop_env:OSFTabletop-v0")`, which processes of vectorised
+environments need. Gymnasium has no entry points for packages since 1.0.
+
+Raises:
+    MissingExtra: on import, if Gymnasium is not installed.
 """
 
 from __future__ import annotations
@@ -9,11 +19,11 @@ import contextlib
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import gymnasium
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from osfcore.errors import InvalidInput, NoRoom, OsfError, finite_vector
+from osfcore.extras import need
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
 from osfcore.geometry.states import pose_rows
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S, TABLE_SIDE_M, check_action
@@ -24,6 +34,12 @@ from osfcore.objects.data_dir import default_data_dir
 from osfcore.world.scenes import SceneRequest, check_request
 from osfcore.world.tabletop import Tabletop
 from osfcore.world.tasks import Family, TaskSet, check_tasks, draw_task
+
+need("gym", "The environment")
+import gymnasium  # noqa: E402
+
+TABLETOP_ID = "OSFTabletop-v0"
+ACTIONS = 30  # of 0.2 s before an episode is truncated, as in evaluations of rearrangement
 
 Kind = Literal["poses", "pixels", "both"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -216,3 +232,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         figures = {"moved_mm": score.moved_mm, "moved_deg": score.moved_deg, "others_mm": score.others_mm}
         names = {"names": list(self._begun().start.names), "moved": list(self._begun().moved)}
         return {**names, "success": score.is_tight(), **figures}
+
+
+if TABLETOP_ID not in gymnasium.registry:
+    gymnasium.register(TABLETOP_ID, entry_point=f"{__name__}:TabletopEnv", max_episode_steps=ACTIONS)

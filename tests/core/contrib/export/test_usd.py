@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from pxr import Ar, Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
-from osfcore.export.usd import field_usd, scene_usdz
+from osfcore.contrib.export.usd import field_usd, scene_usdz
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera, default_cameras
 from osfcore.io.scene_file import Scene

@@ -4,7 +4,7 @@ import gsply
 import numpy as np
 import pytest
 
-from osfcore.export.splats import field_splats, splats_ply
+from osfcore.contrib.export.splats import field_splats, splats_ply
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_to_matrix

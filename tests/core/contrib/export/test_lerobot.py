@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from osfcore.errors import InvalidInput
-from osfcore.export.lerobot import (
+from osfcore.contrib.export.lerobot import (
     DatasetSize,
     LeRobotEpisode,
     environment_names,
@@ -21,6 +20,7 @@ from osfcore.export.lerobot import (
     statistics_of,
     write_dataset,
 )
+from osfcore.errors import InvalidInput
 from tests.support.errors import about
 
 BOX, MUG, CAN = "009_gelatin_box", "025_mug", "005_tomato_soup_can"

@@ -9,14 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from osfcore.errors import CorruptFile, InvalidInput, UnknownName
-from osfcore.estimation.objective import resting_orientations
-from osfcore.fields.field_library import FieldLibrary
-from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_to_matrix, rotation_angle
-from osfcore.geometry.states import EstimatedState, Observation
-from osfcore.io.image_file import write_png
-from osfcore.photo.bop import (
+from osfcore.contrib.bop import (
     BopChoice,
     PoseChoice,
     bop_results,
@@ -27,6 +20,13 @@ from osfcore.photo.bop import (
     read_poses,
     scene_gt_names,
 )
+from osfcore.errors import CorruptFile, InvalidInput, UnknownName
+from osfcore.estimation.objective import resting_orientations
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.cameras import default_cameras
+from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_to_matrix, rotation_angle
+from osfcore.geometry.states import EstimatedState, Observation
+from osfcore.io.image_file import write_png
 from osfcore.photo.pose_loss import TablePrior
 from tests.support.bop_scenes import annotation, write_bop_scene, write_models_info
 from tests.support.errors import about

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from fastapi import FastAPI, Response
 
+from osfcore.contrib.robots.connect import connect
+from osfcore.contrib.robots.guarded_world import GuardedWorld
+from osfcore.contrib.robots.http_robot import HttpRobot, SentCamera, observation_of
+from osfcore.contrib.robots.robot import ConnectionLost, RobotRefused, RobotStopped, SafetyLimits
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import encode_png
-from osfcore.robots.connect import connect
-from osfcore.robots.guarded_world import GuardedWorld
-from osfcore.robots.http_robot import HttpRobot, SentCamera, observation_of
-from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped, SafetyLimits
 from tests.live import free_port
 from tests.support.errors import about
 from tests.support.robots import NAMES, example, serving, until

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from osfcore.environments import ACTIONS, TABLETOP_ID, tabletop_env
+from osfcore.contrib import tabletop_env
+from osfcore.contrib.tabletop_env import ACTIONS, TABLETOP_ID
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.geometry.workspace import STEP_S
 from osfcore.metrics.success import RearrangementTask
@@ -122,7 +123,9 @@ def test_a_task_of_an_evaluation_can_be_asked_for(made, library):
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_environments_side_by_side_are_those_one_by_one(data_dir, made, mode):
     chosen = {"data_dir": data_dir, "names": NAMES, "objects": 2, "obs": "both", "image_side": 32}
-    envs = gymnasium.make_vec(f"osfcore.environments:{TABLETOP_ID}", num_envs=2, vectorization_mode=mode, **chosen)
+    envs = gymnasium.make_vec(
+        f"osfcore.contrib.tabletop_env:{TABLETOP_ID}", num_envs=2, vectorization_mode=mode, **chosen
+    )
     try:
         seen, _ = envs.reset(seed=7)
         later, rewards, *_ = envs.step(np.full((2, 2), 0.1, np.float32))

@@ -20,7 +20,7 @@ import trimesh
 from jaxtyping import Float
 from trimesh.visual import TextureVisuals
 
-from osfcore.export.meshes import OPENCV_TO_GLTF, camera_node, field_meshes, light_matrix, scene_meshes
+from osfcore.contrib.export.meshes import OPENCV_TO_GLTF, camera_node, field_meshes, light_matrix, scene_meshes
 from osfcore.extras import need
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from osfcore.contrib.robots.guarded_world import GuardedWorld, OutlinedWorld
+from osfcore.contrib.robots.robot import ConnectionLost, RobotStopped, SafetyLimits
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import STEP_S
-from osfcore.robots.guarded_world import GuardedWorld, OutlinedWorld
-from osfcore.robots.robot import ConnectionLost, RobotStopped, SafetyLimits
 from tests.support.errors import about
 from tests.support.robots import NAMES, simulated
 

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from osfcore.contrib.robots.connect import connect
+from osfcore.contrib.robots.guarded_world import GuardedWorld
+from osfcore.contrib.robots.robot import ConnectionLost, RobotRefused, RobotStopped, SafetyLimits
+from osfcore.contrib.robots.ros_robot import RosNames, RosRobot, TransformTree
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.estimation.camera_response import linear_of_srgb
 from osfcore.geometry.poses import Pose, quaternion_exp
-from osfcore.robots.connect import connect
-from osfcore.robots.guarded_world import GuardedWorld
-from osfcore.robots.robot import ConnectionLost, RobotRefused, RobotStopped, SafetyLimits
-from osfcore.robots.ros_robot import RosNames, RosRobot, TransformTree
 from tests.live import free_port
 from tests.support.errors import about
 from tests.support.robots import until

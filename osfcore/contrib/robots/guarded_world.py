@@ -11,6 +11,7 @@ from itertools import chain
 import numpy as np
 from jaxtyping import Float
 
+from osfcore.contrib.robots.robot import RobotStopped, SafetyLimits, Stoppable, Whereabouts
 from osfcore.control.world import World, without_cameras
 from osfcore.errors import InvalidInput, OsfError, check_known
 from osfcore.estimation.camera_response import srgb_of_linear
@@ -18,7 +19,6 @@ from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import STEP_S, check_action
 from osfcore.io.image_file import to_uint8
 from osfcore.photo.segmentation import Box, propose_masks
-from osfcore.robots.robot import RobotStopped, SafetyLimits, Stoppable, Whereabouts
 
 _OVERSHOT_M = 0.01  # a pusher may have come so far outside the box by itself, and returns
 

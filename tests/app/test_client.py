@@ -11,8 +11,7 @@ from jsonschema import Draft202012Validator
 
 from app.api.app_factory import create_app
 from app.jobs.job import FINISHED, State
-from osfcore.client import Client, Episode, Estimate, Health, ServiceError
-from osfcore.client.client import Connection, Mode
+from osfcore.contrib.client import Client, Connection, Episode, Estimate, Health, Mode, ServiceError
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
 from osfcore.io.image_file import encode_png, to_uint8

@@ -17,8 +17,8 @@ import trimesh
 from jaxtyping import Float32
 from scipy.spatial import KDTree
 
+from osfcore.contrib.export.meshes import baked
 from osfcore.dynamics.shapes import field_mesh
-from osfcore.export.meshes import baked
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.light import AMBIENT, DIFFUSE, Light
 
