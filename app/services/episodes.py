@@ -20,7 +20,7 @@ from app.services.goals.goal_checks import GoalChecks
 from app.services.goals.goals import GOAL_SIDE, Goals, NoTable
 from app.services.runner import Runner
 from app.storage.database import CannotStore
-from app.storage.goal_store import GoalRecord, Poses, poses_to_json
+from app.storage.records import GoalRecord, Poses, poses_to_json
 from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput, OsfError, check_seed
 from osfcore.geometry.cameras import goal_camera

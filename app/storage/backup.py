@@ -16,8 +16,7 @@ from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from app.storage.database import now_utc
-from app.storage.schema import FILE, SCHEMA_VERSION, CannotStore, check_database, copy_database
+from app.storage.database import FILE, SCHEMA_VERSION, CannotStore, check_database, copy_database, now_utc
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, shown
 from osfcore.io.archives import ArchiveKind, unpack
 from osfcore.io.files import file_at_once, folder_at_once, read_json

@@ -3,6 +3,9 @@
 One process at a time: a lock file keeps a second service out, which would take the first one's jobs for dead.
 What was accepted is on the disk before its caller hears of it. What has happened anyway, such as a push, is remembered
 while the disk refuses, and written with the next write or `retry` that it takes.
+
+A file of an older version is migrated, with a copy kept beside it. One that a newer version wrote, or that is damaged,
+is renamed and an empty one takes its place: a service that does not start helps nobody, and nothing is deleted.
 """
 
 from __future__ import annotations
@@ -13,17 +16,57 @@ import json
 import logging
 import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import astuple, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any
+
+from pydantic import Field, FiniteFloat
 
 from app.processes.messages.scene_messages import SceneRecord
-from app.storage.rows import SCENE_COLUMNS, SENSELESS, SetAside, job_of_row, scene_of_row, scene_row, set_aside_row
-from app.storage.schema import FILE, SCHEMA_VERSION, CannotStore, UnusableDatabase, open_database, put_aside
-from osfcore.errors import OsfError
-from osfcore.io.json_codec import decode
+from osfcore.errors import CorruptFile, InvalidInput, OsfError, shown
+from osfcore.geometry.cameras import image_side
+from osfcore.io.files import put_in_place, sync
+from osfcore.io.json_codec import Entry, Text, decode, encode
+from osfcore.io.scene_file import StateJson
 
+FILE = "service.sqlite3"
+_APPLICATION_ID = 0x4F534631  # "OSF1"
+# Each brings a file of the version before it to its own; what was released is never changed.
+_MIGRATIONS = (
+    (
+        1,
+        """
+CREATE TABLE scenes (
+    id TEXT PRIMARY KEY, seed INTEGER NOT NULL, created_at TEXT NOT NULL, image_size INTEGER NOT NULL,
+    initial TEXT NOT NULL, state TEXT NOT NULL, time_s REAL NOT NULL, revision INTEGER NOT NULL,
+    is_current INTEGER NOT NULL DEFAULT 0
+);
+CREATE TABLE jobs (id TEXT PRIMARY KEY, number INTEGER NOT NULL, job TEXT NOT NULL);
+CREATE TABLE events (id INTEGER PRIMARY KEY AUTOINCREMENT, job TEXT NOT NULL);
+""",
+    ),
+    (
+        2,
+        """
+CREATE TABLE set_aside (
+    number INTEGER PRIMARY KEY, kind TEXT NOT NULL, id TEXT NOT NULL, row TEXT NOT NULL, reason TEXT NOT NULL,
+    at TEXT NOT NULL
+);
+""",
+    ),
+)
+SCHEMA_VERSION = _MIGRATIONS[-1][0]
+_READ_BY_EVERY_VERSION = (
+    "SELECT id, seed, created_at, image_size, initial, state, time_s, revision, is_current FROM scenes LIMIT 0",
+    "SELECT id, number, job FROM jobs LIMIT 0",
+    "SELECT id, job FROM events LIMIT 0",
+)
+_SCENE_COLUMNS: tuple[str, ...] = ("id", "seed", "created_at", "image_size", "initial", "state", "time_s", "revision")
+_SENSELESS = (ValueError, TypeError, RecursionError)  # what reading a row raises if it makes no sense
+_Count = Annotated[int, Field(ge=0)]
 Statement = tuple[str, tuple[Any, ...]]
 _log = logging.getLogger(__name__)
 
@@ -35,6 +78,27 @@ class DataDirectoryInUse(OsfError):
         super().__init__(f"Another service uses the data directory {data_dir}; stop it or choose another one.")
 
 
+class CannotStore(OsfError):
+    """The data directory cannot be written."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(f"{path} cannot be written ({reason}); free some space or choose another data directory.")
+
+
+class UnusableDatabase(CorruptFile):
+    """A database of this program that this version cannot work with.
+
+    Args:
+        path: of the file.
+        label: what is wrong with it, as part of a file name.
+        reason: the same for people.
+    """
+
+    def __init__(self, path: Path, label: str, reason: str) -> None:
+        super().__init__(path, reason)
+        self.label, self.reason = label, reason
+
+
 def now_utc() -> str:
     """The time in UTC, ISO 8601 with milliseconds."""
     return utc_of(datetime.now(UTC).timestamp())
@@ -43,6 +107,9 @@ def now_utc() -> str:
 def utc_of(seconds: float) -> str:
     """A moment since the epoch [s] in the same form."""
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+# The open database
 
 
 def check_data_dir(data_dir: Path) -> None:
@@ -182,11 +249,11 @@ class Store:
             CannotStore: if the disk refuses and it cannot wait.
         """
         sql = (
-            f"INSERT INTO scenes ({', '.join(SCENE_COLUMNS)}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
+            f"INSERT INTO scenes ({', '.join(_SCENE_COLUMNS)}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
             " ON CONFLICT (id) DO UPDATE SET state = excluded.state, time_s = excluded.time_s,"
             " revision = excluded.revision"
         )
-        self._write((sql, scene_row(record)), waits_as=f"scene {record.id}" if can_wait else None)
+        self._write((sql, _scene_row(record)), waits_as=f"scene {record.id}" if can_wait else None)
 
     def delete_scene(self, scene: str) -> None:
         """Forget a scene.
@@ -204,12 +271,12 @@ class Store:
         """All scenes, oldest first, and the one that is shown; what makes no sense is set aside."""
         records, current = [], None
         for rowid, is_current, *values in self._read(
-            f"SELECT rowid, is_current, {', '.join(SCENE_COLUMNS)} FROM scenes ORDER BY created_at, rowid"
+            f"SELECT rowid, is_current, {', '.join(_SCENE_COLUMNS)} FROM scenes ORDER BY created_at, rowid"
         ):
-            row = dict(zip(SCENE_COLUMNS, values, strict=True))
+            row = dict(zip(_SCENE_COLUMNS, values, strict=True))
             try:
-                records.append(scene_of_row(row))
-            except SENSELESS as error:
+                records.append(_scene_of_row(row))
+            except _SENSELESS as error:
                 self._put_aside("scene", rowid, row, error)
                 continue
             current = records[-1].id if is_current else current
@@ -274,8 +341,8 @@ class Store:
         found = []
         for rowid, job, number, text in self._read("SELECT rowid, id, number, job FROM jobs ORDER BY number, rowid"):
             try:
-                found.append((decode(int, number, "number"), parse(job_of_row(text, job))))
-            except SENSELESS as error:
+                found.append((decode(int, number, "number"), parse(_job_of_row(text, job))))
+            except _SENSELESS as error:
                 self._put_aside("job", rowid, {"id": job, "number": number, "job": text}, error)
         return tuple(found)
 
@@ -283,8 +350,8 @@ class Store:
         """Events later than `number`, as far as they are kept and `parse` understands them, in order."""
         found = []
         for event, text in self._read("SELECT id, job FROM events WHERE id > ? ORDER BY id", (number,)):
-            with contextlib.suppress(*SENSELESS):
-                found.append((event, parse(job_of_row(text))))
+            with contextlib.suppress(*_SENSELESS):
+                found.append((event, parse(_job_of_row(text))))
         return tuple(found)
 
     def _put_aside(self, kind: str, rowid: int, row: dict[str, Any], error: Exception) -> None:
@@ -310,4 +377,225 @@ def _claim(data_dir: Path) -> IO[str]:
 
 
 def _note(entry: SetAside) -> Statement:
-    return "INSERT INTO set_aside (kind, id, row, reason, at) VALUES (?, ?, ?, ?, ?)", set_aside_row(entry)
+    return "INSERT INTO set_aside (kind, id, row, reason, at) VALUES (?, ?, ?, ?, ?)", _set_aside_row(entry)
+
+
+# Rows: what is written for scenes and jobs, and what is checked when it is read again
+
+
+@dataclass(frozen=True, slots=True)
+class SetAside:
+    """Something stored that makes no sense to this version, and was moved out of the way.
+
+    Attributes:
+        kind: "scene", "job" or "database".
+        id: identifier, or the name that a whole file has now.
+        row: all that was stored, as JSON; empty for a file.
+        reason: why it makes no sense.
+        at: UTC, ISO 8601.
+    """
+
+    kind: str
+    id: str
+    row: str
+    reason: str
+    at: str
+
+    @property
+    def sentence(self) -> str:
+        """What happened, for people."""
+        if self.kind == "database":
+            return f"{FILE} cannot be used: {self.reason}; it is named {self.id} now, and an empty one took its place."
+        return f"The stored {self.kind} {shown(self.id)} makes no sense and was set aside: {self.reason}."
+
+
+def _set_aside_row(entry: SetAside) -> tuple[str, ...]:
+    """Its values; halves of characters, which no database takes, are spelled out."""
+    return tuple(text.encode("utf-8", "backslashreplace").decode() for text in astuple(entry))
+
+
+class _Scene(Entry):
+    id: Text
+    seed: _Count
+    created_at: Text
+    image_size: int
+    initial: StateJson
+    state: StateJson
+    time_s: Annotated[FiniteFloat, Field(ge=0)]
+    revision: _Count
+
+
+def _scene_row(record: SceneRecord) -> tuple[Any, ...]:
+    """The values of a scene in the order of the columns."""
+    states = {name: json.dumps(encode(StateJson.of(getattr(record, name)))) for name in ("initial", "state")}
+    return tuple(states.get(name, getattr(record, name)) for name in _SCENE_COLUMNS)
+
+
+def _scene_of_row(row: Mapping[str, Any]) -> SceneRecord:
+    """The scene in a row, by the names of the columns.
+
+    Raises:
+        ValueError, TypeError, RecursionError: if it makes no sense.
+    """
+    texts = {name: json.loads(row[name]) for name in ("initial", "state")}
+    entry = decode(_Scene, {**row, **texts}, "scene")
+    initial, state = entry.initial.state(), entry.state.state()
+    if initial.names != state.names:
+        raise InvalidInput("list of objects", ", ".join(state.names), f"as it began: {', '.join(initial.names)}")
+    facts = {name: getattr(entry, name) for name in ("id", "seed", "created_at", "time_s", "revision")}
+    return SceneRecord(**facts, image_size=image_side(entry.image_size), initial=initial, state=state)
+
+
+def _job_of_row(text: str, job: str | None = None) -> dict[str, Any]:
+    """The fields of a job in a row, such that they can be told to pages.
+
+    Args:
+        text: that was stored.
+        job: identifier of the row, if it has one.
+
+    Raises:
+        ValueError, TypeError, RecursionError: if they make no sense.
+    """
+    fields = json.loads(text)
+    if not isinstance(fields, dict):
+        raise InvalidInput("job", shown(fields), "a JSON object")
+    if job is not None and fields.get("id", job) != job:
+        raise InvalidInput("id", shown(fields["id"]), f"that of its row, {shown(job)}")
+    json.dumps(fields, allow_nan=False, ensure_ascii=False).encode()  # neither NaN nor halves of characters
+    return fields
+
+
+# The file: opened whatever state it is in, brought to this version, or put aside
+
+
+def check_database(path: Path) -> int:
+    """The version of a database file; 0 if it is empty.
+
+    Raises:
+        UnusableDatabase: if it is damaged, or a newer version wrote it.
+        CorruptFile: if it is another program's.
+        CannotStore: if it cannot be opened.
+    """
+    with _connected(path) as database:
+        version = database.execute("PRAGMA user_version").fetchone()[0]
+        owner = database.execute("PRAGMA application_id").fetchone()[0]
+        if database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
+            return 0
+        if owner != _APPLICATION_ID:
+            raise CorruptFile(path, "it is another program's database; move it away")
+        if version > SCHEMA_VERSION:
+            raise UnusableDatabase(
+                path,
+                f"newer-{version}",
+                f"a newer version wrote it (format {version}, this one knows {SCHEMA_VERSION})",
+            )
+        if version < 1 or not _is_sound(database):
+            raise UnusableDatabase(path, "damaged", "it is damaged")
+    return version
+
+
+def open_database(path: Path) -> sqlite3.Connection:
+    """A connection to a database of this version, which is made or migrated if need be.
+
+    Raises:
+        UnusableDatabase: if it is damaged, or a newer version wrote it.
+        CorruptFile: if it is another program's.
+        CannotStore: if it cannot be written.
+    """
+    version = check_database(path)
+    try:
+        if 0 < version < SCHEMA_VERSION:
+            _keep_copy(path, unused(path.with_name(f"{path.name}.format-{version}")))
+        return _migrated(path, version)
+    except sqlite3.DatabaseError as error:
+        raise CannotStore(path, str(error)) from error
+    except OSError as error:
+        raise CannotStore(path, error.strerror or str(error)) from error
+
+
+def put_aside(path: Path, label: str) -> Path:
+    """Rename a database with what belongs to it, so that another one can take its place; returns its new name.
+
+    Raises:
+        CannotStore: if that is not allowed.
+    """
+    place = unused(path.with_name(f"{path.name}.{label}"))
+    try:
+        for suffix in ("-wal", "-shm", ""):  # beside a new file, the older one's log would be taken for its own
+            part = path.with_name(path.name + suffix)
+            if part.exists():
+                part.rename(place.with_name(place.name + suffix))
+        sync(path.parent)
+    except OSError as error:
+        raise CannotStore(path, error.strerror or str(error)) from error
+    return place
+
+
+def copy_database(path: Path, place: Path) -> None:
+    """Write a copy of a database that others may be using, as it is at one moment; it outlives a power failure.
+
+    Raises:
+        sqlite3.DatabaseError: if it cannot be read or the copy cannot be written.
+        OSError: likewise.
+    """
+    source = sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)
+    with contextlib.closing(source), contextlib.closing(sqlite3.connect(place)) as copy:
+        source.backup(copy)
+    sync(place)
+
+
+def unused(path: Path) -> Path:
+    """A path that nothing has: this one, or with a number behind it."""
+    number, free = 1, path
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.name}.{number}")
+    return free
+
+
+@contextlib.contextmanager
+def _connected(path: Path) -> Iterator[sqlite3.Connection]:
+    """A connection for a look, after which every failure is one of ours."""
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as database:
+            yield database
+    except sqlite3.OperationalError as error:
+        raise CannotStore(path, str(error)) from error
+    except sqlite3.DatabaseError as error:
+        raise UnusableDatabase(path, "damaged", "it is damaged") from error
+
+
+def _is_sound(database: sqlite3.Connection) -> bool:
+    if database.execute("PRAGMA quick_check").fetchone()[0] != "ok":
+        return False
+    try:
+        for statement in _READ_BY_EVERY_VERSION:
+            database.execute(statement)
+    except sqlite3.OperationalError:  # no such table, or column
+        return False
+    return True
+
+
+def _keep_copy(path: Path, place: Path) -> None:
+    partial_copy = place.with_name(f".{place.name}.part")
+    partial_copy.unlink(missing_ok=True)
+    copy_database(path, partial_copy)
+    put_in_place(partial_copy, place)
+
+
+def _migrated(path: Path, version: int) -> sqlite3.Connection:
+    database = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+    try:
+        database.execute("PRAGMA journal_mode = WAL")
+        # With NORMAL a power failure may take the last commits with it, and jobs that were answered 202 would be gone.
+        # FULL waits for the disk at every commit: 0.3 ms on an SSD instead of 0.02 ms, for a few commits a second.
+        database.execute("PRAGMA synchronous = FULL")
+        database.text_factory = partial(str, encoding="utf-8", errors="surrogateescape")  # one bad text hides no other
+        if version < SCHEMA_VERSION:
+            steps = "".join(sql for target, sql in _MIGRATIONS if target > version)
+            marks = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
+            database.executescript(f"BEGIN IMMEDIATE; {marks} {steps} COMMIT;")
+    except BaseException:
+        database.close()
+        raise
+    return database

@@ -28,7 +28,7 @@ from app.api.schemas.goals import (
 from app.api.schemas.limits import CAMERA_JSON, GOAL_NAME, NAME, sized
 from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
 from app.services.goals.goals import Draft, NoDraft
-from app.storage.goal_store import GoalRecord
+from app.storage.records import GoalRecord
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.io.scene_file import camera_from_json

@@ -29,7 +29,7 @@ from app.api.schemas.photos import (
     TablePhotoOut,
     facts_of,
 )
-from app.storage.table_photos import TablePhoto
+from app.storage.records import TablePhoto
 from osfcore.photo.board import Board, board_pdf
 from osfcore.photo.calibration import known_camera
 

@@ -12,8 +12,8 @@ from app.api.schemas.limits import GOAL_NAME, NAME, OBJECTS, sized, within
 from app.api.schemas.paging import PageOut
 from app.services.goals.goal_checks import GoalCheck, GoalVerdict
 from app.services.goals.goals import Draft
-from app.storage.goal_store import GoalRecord, Source
-from app.storage.photo_crop import PhotoCrop
+from app.storage.photos import PhotoCrop
+from app.storage.records import GoalRecord, Source
 from osfcore.geometry.poses import Pose
 from osfcore.io.scene_file import CameraJson, ObjectJson
 

@@ -28,7 +28,7 @@ from app.api.schemas.paging import PageOut
 from app.jobs.job import Job
 from app.jobs.kinds.photos import sheet_name
 from app.processes.messages.photo_messages import CameraSource, Mark, Points, Stroke
-from app.storage.table_photos import MarkedObject, TablePhoto
+from app.storage.records import MarkedObject, TablePhoto
 from osfcore.photo.found_scene import FoundLight, FoundPose, FoundScene, TableSource
 
 Pixel = Annotated[FiniteFloat, Field(**within(PIXEL))]

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from app.jobs.job import SceneNeeded
 from app.processes.messages.scene_messages import SceneRecord
 from app.services.goals.goals import Goals
-from app.services.runner import Runner
-from app.storage.goal_store import GoalRecord
+from app.services.runner import Runner, SceneNeeded
+from app.storage.records import GoalRecord
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import shifted_poses

@@ -14,7 +14,7 @@ from app.processes.process_client import ProcessClient, ProcessUnavailable
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.goals.goals import Goals, NoTable
 from app.services.runner import Runner
-from app.storage.goal_store import GoalRecord
+from app.storage.records import GoalRecord
 from osfcore.errors import OsfError, UnknownName
 from osfcore.estimation.steps import ContentCheck, Verdict
 

@@ -15,9 +15,8 @@ from PIL import Image
 from app.processes.messages.scene_messages import ComposedGoal, ComposeGoal
 from app.services.runner import Runner
 from app.storage.database import now_utc
-from app.storage.goal_store import GoalRecord, GoalStore, PhotoRecord, Poses, Source
-from app.storage.photo_crop import PhotoCrop, central_crop, check_crop, cut_out
-from app.storage.photos import Photo, PhotoReader
+from app.storage.photos import Photo, PhotoCrop, PhotoReader, central_crop, check_crop, cut_out
+from app.storage.records import GoalRecord, GoalStore, PhotoRecord, Poses, Source
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light

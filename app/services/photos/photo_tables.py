@@ -16,9 +16,8 @@ from app.processes.process_client import ProcessClient
 from app.services.goals.goals import Goals
 from app.services.photos.table_photos import TablePhotos
 from app.services.runner import Runner
-from app.storage.goal_store import GoalRecord, Poses
-from app.storage.photo_crop import GOAL_SIDE
-from app.storage.table_photos import TablePhoto
+from app.storage.photos import GOAL_SIDE
+from app.storage.records import GoalRecord, Poses, TablePhoto
 from osfcore.errors import NoRoom, OsfError
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import SceneState

@@ -19,7 +19,7 @@ from app.services.fields import FieldCatalogue
 from app.services.photos.photo_looker import PhotoLooker
 from app.services.runner import Runner
 from app.storage.database import CannotStore, now_utc
-from app.storage.table_photos import PICTURE, STRAIGHT, MarkedObject, TablePhoto, TablePhotoStore, mask_file
+from app.storage.records import PICTURE, STRAIGHT, MarkedObject, TablePhoto, TablePhotoStore, mask_file
 from osfcore.errors import InvalidInput, NotThere, OsfError, UnknownName, check_seed
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.files import read_json

@@ -32,7 +32,7 @@ from app.services.fields import FieldCatalogue, MissingFields, NoPublishedField
 from app.services.goals.goal_checks import GoalRefused
 from app.services.goals.goals import NoTable
 from app.storage.database import CannotStore
-from app.storage.goal_store import GoalRecord, GoalStore, poses_to_json
+from app.storage.records import GoalRecord, GoalStore, poses_to_json
 from osfcore.control.events import EpisodeSettings
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.geometry.cameras import goal_camera

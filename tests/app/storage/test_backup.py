@@ -10,8 +10,7 @@ import pytest
 
 from app.jobs.registry import Jobs
 from app.storage.backup import FOLDERS, MANIFEST, back_up, restore
-from app.storage.database import Store
-from app.storage.schema import FILE, SCHEMA_VERSION
+from app.storage.database import FILE, SCHEMA_VERSION, Store
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from tests.app.conftest import full_disk
 from tests.app.storage.test_database import change, record

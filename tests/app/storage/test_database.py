@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from app.processes.messages.scene_messages import SceneRecord
-from app.storage.database import DataDirectoryInUse, Store, check_data_dir
-from app.storage.schema import FILE, SCHEMA_VERSION, CannotStore
+from app.storage.database import FILE, SCHEMA_VERSION, CannotStore, DataDirectoryInUse, Store, check_data_dir
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose

@@ -3,12 +3,12 @@ from pathlib import Path
 
 import pytest
 
-from app.jobs.job_folders import JobFolders
+from app.jobs.folders import JobFolders
 from app.storage.field_files import install
-from app.storage.goal_store import GoalStore
+from app.storage.records import GoalStore
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
 from osfcore.io.files import folder_at_once, put_in_place, write_atomically
-from tests.app.storage.test_goal_store import PNG, goal
+from tests.app.storage.test_records import PNG, goal
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from app.api.schemas.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalOut
 from app.services.goals.goals import Draft
-from app.storage.goal_store import GoalRecord
+from app.storage.records import GoalRecord
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import MAX_OBJECTS

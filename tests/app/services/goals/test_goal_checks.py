@@ -10,8 +10,8 @@ from app.processes.process_client import ProcessUnavailable
 from app.services.fields import MissingFields
 from app.services.goals.goal_checks import GoalChecks, GoalRefused
 from app.services.goals.goals import NoTable
-from app.storage.goal_store import GoalRecord, GoalStore, PhotoRecord
-from app.storage.photo_crop import PhotoCrop
+from app.storage.photos import PhotoCrop
+from app.storage.records import GoalRecord, GoalStore, PhotoRecord
 from osfcore.errors import UnknownName
 from osfcore.estimation.steps import ContentCheck
 from osfcore.geometry.cameras import goal_camera

@@ -26,9 +26,8 @@ from app.services.goals.goals import (
 )
 from app.services.scenes import SceneHeld
 from app.storage.database import CannotStore
-from app.storage.goal_store import GoalStore, TooManyGoals
-from app.storage.photo_crop import PhotoCrop
-from app.storage.photos import PhotoRefused, read_photo
+from app.storage.photos import PhotoCrop, PhotoRefused, read_photo
+from app.storage.records import GoalStore, TooManyGoals
 from app.storage.usage import StorageMeter
 from osfcore.errors import InvalidInput, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera
