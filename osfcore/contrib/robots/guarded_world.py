@@ -22,6 +22,13 @@ from osfcore.photo.segmentation import Box, propose_masks
 
 _OVERSHOT_M = 0.01  # a pusher may have come so far outside the box by itself, and returns
 
+# How far what a robot says of its pusher may differ from what was asked of it.
+_PLACE_ERROR_M = 0.01  # of a measured place: calibration, and the give of an arm that pushes
+_LAG_S = 0.1  # for which a controller may go on after a motion
+_FELT_M = 0.005  # shorter motions say nothing of whether it moves: a measured place trembles
+_LEAST_SHARE = 1 / 3  # of a motion that is done: a controller that needs 0.1 s to speed up does half of each 0.2 s
+_HELD_M = 0.1  # of motions in a row of which less was done: an object may hold the pusher for one, but not for ever
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HeldBack:
@@ -42,6 +49,10 @@ class GuardedWorld:
     An action above the top speed is done slower, for longer, along the same path. A path out of the box ends at its
     wall. Between two observations the pusher may be wherever its actions can have brought it; no such place is outside.
 
+    Each place that the robot says is compared with what was asked since the one before. A pusher that is where no part
+    of its actions leads is stopped. One that does less than a third may be held by an object, or its place may not be
+    measured at all: until it is seen to move, it counts as being anywhere between, and after 10 cm it is stopped.
+
     `stop`, `close` and any error while the robot looks or moves stop it. After that `act` only raises `RobotStopped`.
 
     Args:
@@ -53,6 +64,10 @@ class GuardedWorld:
     def __init__(self, world: World, limits: SafetyLimits, permit: Callable[[], bool] | None = None) -> None:
         self._world, self._limits, self._permit = world, limits, permit
         self._where: Whereabouts | None = None
+        self._seen_at = np.zeros(2)  # where the robot said last that the pusher is [m]
+        self._asked = self._wished = np.zeros(2)  # travel since, and what it would be were that place certain [m]
+        self._fastest_m_s = 0.0  # since then
+        self._unmoved_m = 0.0  # travel asked for since the pusher was last seen to move
         self._reason = ""
         self._stopped = threading.Event()
         self._lock = threading.Lock()
@@ -87,14 +102,25 @@ class GuardedWorld:
     # The World protocol
 
     def reset(self, seed: int) -> Observation:
-        """Reset the wrapped world."""
+        """Reset the wrapped world, whose pusher may be anywhere then."""
         with self._halted_by_errors():
-            return self._seen(self._world.reset(seed))
+            seen = self._world.reset(seed)
+        self._locate(seen.pusher)
+        return seen
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """Observe the wrapped world; also after a stop."""
+        """Observe the wrapped world; also after a stop.
+
+        Raises:
+            RobotStopped: if the pusher is not where its actions lead.
+        """
         with self._halted_by_errors():
-            return self._seen(self._world.observe(masks=masks))
+            seen = self._world.observe(masks=masks)
+        if seen.pusher is None or self._where is None or not self._is_started or self._stopped.is_set():
+            self._locate(seen.pusher)
+        else:
+            self._compare(seen.pusher, self._where)
+        return seen
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
         """Do as much of an action as the limits allow.
@@ -116,8 +142,11 @@ class GuardedWorld:
         if not np.allclose(travel, wanted, atol=1e-6):
             self._held_back.append(HeldBack(action, np.array([*(travel / STEP_S), 0.0])))
         self._begin()
-        self._where = where.after(travel)
-        for velocity in self._limits.slow_parts(travel):
+        parts = self._limits.slow_parts(travel)
+        self._where, self._asked = where.after(travel), self._asked + travel
+        self._wished = self._wished + self._limits.allowed_travel(wanted, Whereabouts.at(self._seen_at))
+        self._fastest_m_s = max(self._fastest_m_s, float(np.linalg.norm(parts[0])))
+        for velocity in parts:
             self.check()
             with self._halted_by_errors():
                 self._world.act(velocity)
@@ -129,9 +158,42 @@ class GuardedWorld:
             self.stop("it was let go")
         self._world.close()
 
-    def _seen(self, observation: Observation) -> Observation:
-        self._where = None if observation.pusher is None else Whereabouts.at(observation.pusher)
-        return observation
+    def _locate(self, pusher: Float[np.ndarray, "3"] | None) -> None:
+        """Take the pusher to be where the robot says."""
+        self._where, self._unmoved_m = None if pusher is None else Whereabouts.at(pusher), 0.0
+        if pusher is not None:
+            self._compare_from(pusher)
+
+    def _compare_from(self, pusher: Float[np.ndarray, "3"]) -> None:
+        self._seen_at, self._fastest_m_s = pusher[:2].astype(float), 0.0
+        self._asked = self._wished = np.zeros(2)
+
+    def _compare(self, pusher: Float[np.ndarray, "3"], where: Whereabouts) -> None:
+        """Compare the place that the robot says with what was asked; stop the robot if they contradict each other.
+
+        Raises:
+            RobotStopped: if they do.
+        """
+        off_m = where.distance_m(pusher[:2])
+        if off_m > _PLACE_ERROR_M + _LAG_S * self._fastest_m_s:
+            off = f"its pusher is {1000 * off_m:.0f} mm away from where it was asked to go"
+            self.stop(f"{off}; see whether something moved it, and whether places and velocities have the same axes")
+            self.check()
+        asked_m, wished_m = float(np.linalg.norm(self._asked)), float(np.linalg.norm(self._wished))
+        if max(asked_m, wished_m) < _FELT_M:  # wait for more
+            self._where = where.with_place(pusher[:2])
+            return
+        moved_m = float((pusher[:2] - self._seen_at) @ self._asked) / max(asked_m, _FELT_M)
+        if asked_m >= _FELT_M and moved_m >= _LEAST_SHARE * asked_m:
+            self._locate(pusher)
+            return
+        # A wall that it may have reached unseen ends its way: then the wish alone is left, and counts.
+        self._where, self._unmoved_m = where.with_place(pusher[:2]), self._unmoved_m + max(asked_m, wished_m)
+        if self._unmoved_m > _HELD_M:
+            unmoved = f"its pusher was asked to go {1000 * self._unmoved_m:.0f} mm, and hardly moved by what it says"
+            self.stop(f"{unmoved}; see whether something holds it, and whether its place is measured")
+            self.check()
+        self._compare_from(pusher)
 
     def _begin(self) -> None:
         """Ask for permission and start the robot, once."""
@@ -162,7 +224,7 @@ class GuardedWorld:
 
     def _stop_world(self) -> None:
         if isinstance(self._world, Stoppable):
-            with contextlib.suppress(OsfError):  # one that cannot be reached halts by itself
+            with contextlib.suppress(Exception):  # one that cannot be reached halts by itself; a stop never fails
                 self._world.stop()
 
 

@@ -98,9 +98,17 @@ class Whereabouts:
     high: Float[np.ndarray, "2"]
 
     @staticmethod
-    def at(position: Float[np.ndarray, "3"]) -> Whereabouts:
-        """Return the point where the pusher was measured."""
+    def at(position: Float[np.ndarray, "*xyz"]) -> Whereabouts:
+        """Return the point where the pusher was measured, of x, y and perhaps z [m]."""
         return Whereabouts(position[:2].astype(float), position[:2].astype(float))
+
+    def distance_m(self, place: Float[np.ndarray, "2"]) -> float:
+        """Return how far outside the rectangle a place is [m]; 0 inside."""
+        return float(np.linalg.norm(np.maximum(0, np.maximum(self.low - place, place - self.high))))
+
+    def with_place(self, place: Float[np.ndarray, "2"]) -> Whereabouts:
+        """Extend the rectangle by a place [m]."""
+        return Whereabouts(np.minimum(self.low, place), np.maximum(self.high, place))
 
     def after(self, travel: Float[np.ndarray, "2"]) -> Whereabouts:
         """Extend the rectangle by a travel [m], any share of which may have been done: objects may hold the pusher."""

@@ -23,10 +23,13 @@ shares = st.floats(0.0, 1.0)
 
 
 class Marble:
-    """A pusher alone: does of each motion as much as it is told to, and remembers what it was asked."""
+    """A pusher alone: does such shares of its motions, the last one first, and all of those after them.
 
-    def __init__(self, place=(0.0, 0.0), shares=(), fails=()):
-        self.place, self.shares, self.fails = np.array(place, float), list(shares), dict(fails)
+    It says where it is, or, if it is `blind`, where it began.
+    """
+
+    def __init__(self, place=(0.0, 0.0), shares=(), fails=(), *, blind=False):
+        self.place, self.shares, self.fails, self.blind = np.array(place, float), list(shares), dict(fails), blind
         self.way, self.velocities, self.told = [self.place.copy()], [], []
 
     def reset(self, seed):
@@ -34,7 +37,8 @@ class Marble:
 
     def observe(self, *, masks=False):
         self._fail("observe")
-        return Observation((), np.zeros((0, 1, 1, 3), np.float32), (), None, np.array([*self.place, 0.06]), 0.0)
+        place = self.way[0] if self.blind else self.place
+        return Observation((), np.zeros((0, 1, 1, 3), np.float32), (), None, np.array([*place, 0.06]), 0.0)
 
     def act(self, action):
         self._fail("act")
@@ -64,20 +68,28 @@ def guarded(world, limits=LIMITS, **more):
     return guard
 
 
+def move_and_look(guard, *actions):
+    for action in actions:
+        guard.act(action)
+        guard.observe()
+
+
 @settings(suppress_health_check=[HealthCheck.too_slow])  # on a busy machine drawing takes its time
 @given(
     st.lists(st.tuples(velocities, st.booleans()), max_size=12),
     st.lists(shares, max_size=40),
     st.tuples(st.floats(BOX[0], BOX[2]), st.floats(BOX[1], BOX[3])),
     st.floats(0.02, 0.42),
+    st.booleans(),
 )
-def test_no_actions_lead_out_of_the_box_or_go_too_fast_whatever_holds_the_pusher(actions, done, begin, speed):
-    world = Marble(begin, done)
+def test_no_actions_lead_out_of_the_box_or_go_too_fast_whatever_holds_the_pusher(actions, done, begin, speed, blind):
+    world = Marble(begin, done, blind=blind)
     guard = guarded(world, SafetyLimits(BOX, speed))
-    for action, looks in actions:
-        guard.act(action)
-        if looks:
-            guard.observe()
+    with contextlib.suppress(RobotStopped):  # one that seems to stand still for long
+        for action, looks in actions:
+            guard.act(action)
+            if looks:
+                guard.observe()
     way = np.array(world.way)
     assert np.all(way >= np.array(BOX[:2]) - 1e-9)
     assert np.all(way <= np.array(BOX[2:]) + 1e-9)
@@ -115,6 +127,68 @@ def test_a_pusher_slightly_outside_returns_and_one_far_outside_is_not_moved():
     assert far.velocities == far.told == []
 
 
+def test_a_pusher_that_always_says_the_same_place_is_stopped_before_it_is_asked_to_go_far():
+    for begin in (0.0, -0.02, -0.08):
+        world = Marble((begin, 0.0), blind=True)
+        guard = guarded(world)
+        with pytest.raises(RobotStopped, check=about("hardly moved")):
+            move_and_look(guard, *[-RIGHT] * 10)
+        assert world.told == ["start", "stop"]
+        assert BOX[0] - 1e-9 <= world.place[0] < -0.05
+
+
+def test_a_pusher_that_goes_back_and_forth_without_moving_is_stopped():
+    guard = guarded(Marble(shares=[0.0] * 100))
+    with pytest.raises(RobotStopped, check=about("hardly moved")):
+        move_and_look(guard, RIGHT, -RIGHT, RIGHT)
+
+
+@pytest.mark.parametrize("share", [3.0, -1.0])
+def test_a_pusher_that_goes_too_far_or_another_way_is_stopped(share):
+    world = Marble(shares=[share] * 3)
+    guard = guarded(world)
+    guard.act(-RIGHT)
+    with pytest.raises(RobotStopped, check=about("away from where")):
+        guard.observe()
+    assert world.told == ["start", "stop"]
+    with pytest.raises(RobotStopped):
+        guard.act(RIGHT)
+
+
+def test_a_pusher_that_an_object_holds_once_goes_on_and_may_be_anywhere_between_until_it_moves():
+    world = Marble(shares=[0.0] * 3)
+    guard = guarded(world)
+    for action, place, held_back in ((RIGHT, 0.0, 0), (RIGHT, 0.06, 0), (RIGHT, 0.12, 0), (RIGHT, 0.12, 1)):
+        guard.act(action)
+        guard.observe()
+        np.testing.assert_allclose(world.place, [place, 0.0], atol=1e-12)
+        assert len(guard.held_back) == held_back
+    world = Marble((0.05, 0.0), shares=[0.0] * 3)
+    guard = guarded(world)
+    move_and_look(guard, RIGHT, RIGHT)
+    np.testing.assert_allclose(world.place, [0.06, 0.0], atol=1e-12)  # it may have been at 0.11 already
+    (one,) = guard.held_back
+    np.testing.assert_allclose(one.done, [0.05, 0.0, 0.0], atol=1e-12)
+
+
+def test_a_controller_that_lags_and_one_that_overshoots_a_little_are_not_stopped():
+    for share in (0.5, 1.15):
+        world = Marble(shares=[share] * 400)
+        guard = guarded(world)
+        move_and_look(guard, *[RIGHT, RIGHT, -RIGHT, -RIGHT] * 10)
+        assert world.told == ["start"]
+
+
+def test_a_pusher_that_is_moved_by_hand_before_it_is_started_is_where_it_is_seen():
+    world = Marble()
+    guard = guarded(world)
+    world.place = np.array([-0.08, 0.1])
+    guard.observe()
+    guard.act(RIGHT)
+    guard.observe()
+    assert world.told == ["start"]
+
+
 def test_nothing_moves_before_its_place_is_known_or_for_what_is_no_action():
     world = Marble()
     with pytest.raises(InvalidInput, check=about("place of the pusher")):
@@ -140,8 +214,9 @@ def test_it_asks_once_before_the_first_motion_and_nothing_moves_if_nobody_allows
     assert "start" not in world.told
 
 
-def test_after_a_stop_every_action_is_refused_with_the_first_reason_and_closing_stops_again():
-    world = Marble(fails={"stop": ConnectionLost("http://robot", "cut")})  # which is no other error
+@pytest.mark.parametrize("error", [ConnectionLost("http://robot", "cut"), RuntimeError("broken")])
+def test_after_a_stop_every_action_is_refused_with_the_first_reason_and_closing_stops_again(error):
+    world = Marble(fails={"stop": error})
     guard = guarded(world)
     guard.act(RIGHT)
     guard.stop("a key was pressed")
