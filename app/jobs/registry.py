@@ -15,20 +15,33 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import Job, JobEvent, JobPage, State, WrongJobState, ended
-from app.jobs.job_folders import JobFolders
-from app.jobs.job_loop import JobLoop, StartProcess, forget_workshop
-from app.jobs.job_process import JobProcess
-from app.jobs.job_table import JobTable
-from app.jobs.outcomes import JobStopped, after
-from app.processes.messages.job_messages import ChangeJob, PauseJob, ResumeJob, StepJob
+from app.jobs.context import ChangeJob, PauseJob, ResumeJob, StepJob
+from app.jobs.folders import JobFolders
+from app.jobs.job import Job, JobEvent, JobPage, State, ended
+from app.jobs.kinds import KINDS, in_words
+from app.jobs.loop import JobLoop, StartProcess, after, clear_cancelled
+from app.jobs.process import JobProcess, JobStopped
+from app.jobs.table import JobTable
 from app.processes.messages.scene_messages import Command
 from app.storage.database import CannotStore, Store
 from osfcore.errors import OsfError
 
 _RETRY_S = 1.0  # after the job loop has failed
 _log = logging.getLogger(__name__)
-_ENDED_AT_ONCE = ("estimate", "photo")  # they leave nothing that needs a grace to tidy up
+
+
+class WrongJobState(OsfError):
+    """An order that does not fit the state that a job is in.
+
+    Args:
+        job: as it is.
+        wanted: what it was to be, as in "cancelled".
+        is_over: whether its process takes no orders any more, although what has become of the job is not known yet.
+    """
+
+    def __init__(self, job: Job, wanted: str, *, is_over: bool = False) -> None:
+        state = "no longer takes orders because it is ending" if is_over else f"is {job.state}"
+        super().__init__(f"This {in_words(job)} {state}, so it cannot be {wanted}.")
 
 
 class QueueFull(OsfError):
@@ -49,7 +62,6 @@ class Jobs:
         cancel_grace_s: how long a cancelled job may take to stop by itself.
         serve: carries out what a job asks for with the scene that it drives.
         start_process: of a job, its data directory, its folder and what takes its events.
-        check: raises an error for a stored job that this version can do nothing with.
     """
 
     def __init__(
@@ -61,14 +73,13 @@ class Jobs:
         cancel_grace_s: float = 0.7,
         serve: Callable[[Command], Any] | None = None,
         start_process: StartProcess = JobProcess,
-        check: Callable[[Job], object] = id,
     ) -> None:
         self._data_dir = data_dir
         self._folders = JobFolders(data_dir)
         self._max_queued = max_queued
         self._cancel_grace_s = cancel_grace_s
         self._changed = threading.Condition(threading.RLock())
-        self._table = JobTable(store, data_dir, publish, check)
+        self._table = JobTable(store, data_dir, publish)
         self._loop = JobLoop(self._changed, self._table, data_dir, publish, serve, start_process)
 
     def start(self) -> None:
@@ -136,13 +147,11 @@ class Jobs:
 
     def holder(self, scene: str) -> Job | None:
         """The job that drives a scene now, if one does: its parameters name it as "scene"."""
-        run = self._loop.run
-        job = self._table[run.id] if run else None
-        return job if job and job.state == "running" and job.params.get("scene") == scene else None
+        return next((job for job in self._driving(scene) if job.state == "running"), None)
 
     def needs(self, scene: str) -> Job | None:
         """A job that waits, runs or pauses and drives a scene, if there is one."""
-        return next((job for job in self.live() if job.params.get("scene") == scene), None)
+        return next(iter(self._driving(scene)), None)
 
     def inputs(self, job: str) -> Path:
         """Where a job's inputs are, if it was given any."""
@@ -196,12 +205,12 @@ class Jobs:
                 raise WrongJobState(known, "cancelled")
             if known.state == "queued":
                 shutil.rmtree(self.folder(job), ignore_errors=True)
-                forget_workshop(self._data_dir, self._table, known)
+                clear_cancelled(self._data_dir, self._table, known)
                 self._table.set(ended(self._table[job], "cancelled", note="Cancelled", error=why))
                 self._table.publish_queue()
                 return self.get(job)
             if self._loop.run is not None:
-                self._loop.run.cancel(0.0 if known.kind in _ENDED_AT_ONCE else self._cancel_grace_s)
+                self._loop.run.cancel(0.0 if KINDS[known.kind].ends_at_once else self._cancel_grace_s)
             if known.error is None and why is not None:
                 self._table.set(replace(self._table[job], error=why))
             self._changed.wait_for(lambda: self._table[job].is_finished, wait_s)
@@ -281,3 +290,7 @@ class Jobs:
             self._loop.run.clock.switch(is_running=after == "running")
             self._table.set(replace(self._table[job], state=after, eta_s=None))
             return self.get(job)
+
+    def _driving(self, scene: str) -> list[Job]:
+        """Return the jobs that wait, run or pause and name a scene in their parameters."""
+        return [job for job in self.live() if job.params.get("scene") == scene]

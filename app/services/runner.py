@@ -10,21 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import (
-    Job,
-    JobChanged,
-    JobEvent,
-    SceneNeeded,
-    SetInUse,
-    TrainingAlready,
-    WorkshopInUse,
-    check_params,
-    in_words,
-)
-from app.jobs.job_process import JobProcess
+from app.jobs.job import Job, JobChanged, JobEvent
+from app.jobs.kinds import KINDS, in_words
+from app.jobs.process import JobProcess, Standby
 from app.jobs.registry import Jobs
-from app.jobs.standby import Standby
-from app.jobs.stored import check_stored
 from app.processes.messages.scene_messages import Act, Command, Disturb, EditScene, UndoDisturbances
 from app.services.event_hub import Notice
 from app.services.image_sets import ImageSets
@@ -40,6 +29,34 @@ from osfcore.objects.asset_library import AssetLibrary, check_name
 _PROBE_S = 5.0  # between two tries whether the disk takes something
 RESERVED = ("table", "sets")  # the table's own field, and a path of the REST interface
 _log = logging.getLogger(__name__)
+
+
+class TrainingAlready(OsfError):
+    """A second order for a field that is being trained."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"A field of {name} is being trained already; wait for it, cancel it or take another name.")
+
+
+class SetInUse(OsfError):
+    """An image set that a job needs."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(f"A training of {job.params['name']} needs these images; wait for it or cancel it first.")
+
+
+class SceneNeeded(OsfError):
+    """A scene that a job needs to go on, or to begin."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(f"This table is needed by the {in_words(job)} that is {job.state}; cancel that first.")
+
+
+class WorkshopInUse(OsfError):
+    """Files of a training that goes on, or waits."""
+
+    def __init__(self, name: str, job: Job) -> None:
+        super().__init__(f"The training of {name} that is {job.state} needs these files; cancel it first.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -81,7 +98,6 @@ class Runner(Scenes):
             settings.cancel_grace_s,
             self._serve,
             start_process=JobProcess if self._standby is None else self._standby.process,
-            check=check_stored,
         )
         self.storage = StorageMeter(settings.data_dir, settings.max_data_bytes, settings.min_free_bytes)
         self.sets = ImageSets(settings.data_dir / "sets", settings.max_image_sets, self.storage.check_room)
@@ -149,7 +165,8 @@ class Runner(Scenes):
         with self._ordering:
             if kind == "train_field":
                 self._check_training(params)
-            check_params(kind, params, self.library.info if fetches else self._check_object, len(self.library.names()))
+            known = self.library.info if fetches else self._check_object
+            KINDS[kind].check(params, known, len(self.library.names()))
             return self.jobs.submit(kind, params)
 
     def submit_with_inputs(self, kind: str, params: dict[str, Any], inputs: Path) -> Job:

@@ -8,7 +8,8 @@ import signal
 import cv2
 import pytest
 
-from app.jobs.outcomes import INTERRUPTED_NOTE, JobDied
+from app.jobs.loop import INTERRUPTED_NOTE
+from app.jobs.process import JobDied
 from tests.app.conftest import until
 from tests.live import SMALL, begun, call, children, free_port, start_service, stop_service
 

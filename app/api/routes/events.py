@@ -23,6 +23,7 @@ from app.api.schemas.goals import DraftOut
 from app.api.schemas.jobs import JobOut
 from app.api.schemas.limits import NAME, VISITOR, sized
 from app.jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
+from app.jobs.kinds import KINDS
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals.goals import DraftChanged, GoalsChanged
@@ -242,7 +243,8 @@ def _replayed(services: Services, number: int, fields: dict[str, Any]) -> Server
     if "forgotten" in fields:
         return _forgotten(number, fields["forgotten"])
     try:
-        return job_event(services, number, job_from_fields(fields))
+        job = job_from_fields(fields)
+        return job_event(services, number, job) if job.kind in KINDS else None
     except (OsfError, TypeError):
         return None
 

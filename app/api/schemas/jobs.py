@@ -19,7 +19,8 @@ from app.api.schemas.limits import (
     within,
 )
 from app.api.schemas.paging import JobPageOut
-from app.jobs.job import Job, Kind, State
+from app.jobs.job import Job, State
+from app.jobs.kinds import KindName
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
 from osfcore.paper.method import Method
 
@@ -138,7 +139,7 @@ class JobOut(BaseModel):
     """A job as it is now."""
 
     id: str
-    kind: Kind
+    kind: KindName
     params: dict[str, Any]
     state: State
     position: int | None = Field(description="Place in the queue, 1 is next; null when not queued.")

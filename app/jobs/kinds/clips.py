@@ -7,6 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from app.episodes.file_names import CLIP_FILE
+from app.jobs.kind import JobKind
+from osfcore.io.json_codec import Entry, Text
 
 if TYPE_CHECKING:
     from app.episodes.clip.clip import ClipStep
@@ -22,3 +24,13 @@ def clip_job(params: dict[str, Any], place: JobContext) -> Iterator[ClipStep]:
     folder = place.folder.parent / params["episode"]
     with ThreadPoolExecutor(_THREADS) as executor:
         yield from clip_of(folder, place.library, folder / CLIP_FILE, executor)
+
+
+class ClipParams(Entry):
+    """What a stored clip must name."""
+
+    episode: Text
+    title: Text
+
+
+CLIP = JobKind("clip", "clip", clip_job, params=ClipParams)

@@ -10,16 +10,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator
 
 from app.episodes.file_names import GOAL_FILE, PREPARED_FILE, RECORDING_FILE
 from app.jobs.job import INPUTS
+from app.jobs.kind import JobKind
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import SceneState
 from osfcore.io.files import read_json
-from osfcore.io.json_codec import decode
+from osfcore.io.json_codec import Entry, Text, decode
 from osfcore.io.scene_file import ObjectJson, camera_from_json
 from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
@@ -260,3 +262,31 @@ def _moved(start: SceneState, target: SceneState | None) -> tuple[str, ...]:
     return tuple(
         n for n, m, rad in zip(start.names, shift_m, turn_rad, strict=True) if m > _STAYS_M or rad > _STAYS_RAD
     )
+
+
+class _Goal(Entry):
+    id: Text | None
+
+
+class EpisodeParams(Entry):
+    """What a stored episode must name."""
+
+    scene: Text
+    names: list[Text]
+    seed: int
+    settings: Annotated[dict[str, Any], AfterValidator(settings_of)]
+    goal: _Goal
+
+
+EPISODE = JobKind(
+    "episode",
+    "episode",
+    episode_job,
+    params=EpisodeParams,
+    preloads=(
+        "osfcore.world.tabletop", "osfcore.control.closed_loop", "osfcore.control.estimators",
+        "app.jobs.kinds.remote_world", "app.episodes.record", "app.episodes.recording",
+    ),
+    uses_physics=True,
+    keeps_steps=True,
+)  # fmt: skip

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from app.jobs.job import INPUTS
+from app.jobs.kind import JobKind
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
-from osfcore.io.json_codec import decode
+from osfcore.io.json_codec import Entry, Text, decode
 from osfcore.io.scene_file import StateJson, state_to_json
 from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
@@ -198,3 +199,26 @@ def _keep(path: Path, progress: Estimating, state: SceneState) -> None:
             file.write(line + "\n")
     except OSError as error:
         raise CannotWrite(path, error.strerror or str(error)) from error
+
+
+class _Of(Entry):
+    scene: Text | None
+
+
+class EstimateParams(Entry):
+    """What a stored estimate must name."""
+
+    mode: Text
+    names: list[Text]
+    cameras: list[Text]
+    of: _Of
+
+
+ESTIMATE = JobKind(
+    "estimate",
+    "estimate",
+    estimate_job,
+    params=EstimateParams,
+    preloads=("osfcore.control.estimators", "app.jobs.kinds.estimates"),
+    ends_at_once=True,
+)

@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from app.jobs.job import Job
+from app.jobs.kind import JobKind
 from app.storage.field_files import clear_workshop, install, install_published, open_workshop
 from osfcore.errors import CannotWrite, CorruptFile
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldLibrary
 from osfcore.io.files import write_atomically
 from osfcore.io.image_file import write_png
+from osfcore.io.json_codec import Entry, Text
 from osfcore.paper.method import Method, own_field_path
 
 if TYPE_CHECKING:
@@ -207,3 +210,27 @@ def _offer(shop: Path, folder: Path, name: str) -> None:
             write_atomically(folder / f"{name}{Path(file).suffix}", (shop / file).read_bytes())
     except OSError as error:
         raise CannotWrite(folder, error.strerror or str(error)) from error
+
+
+class _Source(Entry):
+    mesh: Text | None
+    set: Text | None
+
+
+class TrainingParams(Entry):
+    """What a stored training must name."""
+
+    name: Text
+    source: _Source
+
+
+def _clear(data_dir: Path, job: Job, others: Sequence[Job]) -> None:
+    """Remove what the next training of this name would find, unless another one works there."""
+    name = job.params["name"]
+    if not any(other.params["name"] == name for other in others):
+        clear_workshop(data_dir, name)
+
+
+TRAIN_FIELD = JobKind(
+    "train_field", "training", train_field_job, params=TrainingParams, goes_on=True, on_cancelled=_clear
+)

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from app.jobs.job import INPUTS
+from app.jobs.kind import JobKind
 from app.processes.child_process import limit_memory
 from osfcore.errors import InvalidInput, OsfError
+from osfcore.io.json_codec import Entry, Text
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
@@ -122,3 +124,14 @@ def _length(metres: float) -> str:
     if metres >= 1:
         return f"{metres:,.3g} m" if metres < 1000 else f"{metres:,.0f} m"
     return f"{1000 * metres:.3g} mm"
+
+
+class AddingParams(Entry):
+    """What the stored making of an object must name."""
+
+    name: Text
+    object: dict[str, Any]
+    file_name: Text
+
+
+ADD_OBJECT = JobKind("add_object", "new object", add_object_job, params=AddingParams)

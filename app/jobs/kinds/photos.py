@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from app.jobs.job import INPUTS
+from app.jobs.kind import JobKind
 from osfcore.io.files import write_json
 from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, decode, encode
 from osfcore.random_streams import Stream, stream_rng
@@ -117,3 +118,16 @@ def _draw_sheets(folder: Path, models: PhotoModels, photo: Photograph, found: Ph
 
     for choice, pose in enumerate((found.best, *found.rivals)):
         write_sheet(folder / sheet_name(found.name, choice), models, photo, replace(found, best=pose))
+
+
+class PhotoParams(Entry):
+    """What a stored look at a photo must name."""
+
+    photo: Text
+    title: Text
+    names: list[Text]
+
+
+PHOTO = JobKind(
+    "photo", "look at a photo", photo_job, params=PhotoParams, preloads=("osfcore.photo.summary",), ends_at_once=True
+)

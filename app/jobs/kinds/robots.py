@@ -14,7 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from app.episodes.file_names import GOAL_FILE
-from app.jobs.job import INPUTS
+from app.episodes.robots.stopped_report import STOPPED as REPORT_STOPPED
+from app.episodes.robots.stopped_report import tell_stopped
+from app.jobs.job import INPUTS, Job
+from app.jobs.kind import JobKind
 from app.jobs.kinds.episodes import settings_of, use_one_thread
 from osfcore.contrib.robots.robot import ConnectionLost, SafetyLimits
 
@@ -96,10 +99,13 @@ def _driven(
             write_pictures(place.folder, event.observation)
         yield progress
         if isinstance(event, Planning) and not may_move.is_set():
-            yield replace(progress, drives="asked", note="Waiting for permission to move")
-            if place.orders.next_change() is None:
-                yield progress  # it was cancelled: here the job ends
-            may_move.set()
+            while not may_move.is_set():
+                yield replace(
+                    progress, drives="asked", note="Waiting for permission to move"
+                )  # cancelled, it ends here
+                change = place.orders.next_change() or {}
+                if change.get("allowed") is True:  # other parameters may change, too
+                    may_move.set()
             progress = replace(progress, drives="driving")
             yield progress
 
@@ -129,3 +135,19 @@ def _order(params: dict[str, Any], place: JobContext) -> DriveOrder:
         params["url"], tuple(params["names"]), goal, place.folder, place.data_dir, params["goal_camera"],
         boxes=params["boxes"], limits=limits, seed=params["seed"], settings=settings_of(params["settings"]),
     )  # fmt: skip
+
+
+_WITHOUT_A_WORD = "The robot was stopped: its job was cancelled."
+
+
+def _stopped(job: Job, folder: Path) -> Job:
+    """Return the job of a robot that was broken off with the reason in it and, in the same words, in its report."""
+    result = dict(job.result or {})
+    if result.get("outcome") is None:
+        why = job.error or _WITHOUT_A_WORD
+        tell_stopped(folder, why)
+        result |= {"outcome": REPORT_STOPPED, "text": why}
+    return replace(job, result=result)
+
+
+ROBOT = JobKind("robot", "episode with the robot", robot_job, keeps_steps=True, on_broken_off=_stopped)

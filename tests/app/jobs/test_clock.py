@@ -1,6 +1,6 @@
 import pytest
 
-from app.jobs.clock import JobClock
+from app.jobs.process import JobClock
 
 
 @pytest.fixture

@@ -1,8 +1,8 @@
 import pytest
 
-from app.jobs.job import Job, WrongJobState, ended, job_fields
-from app.jobs.job_folders import JobFolders
-from app.jobs.registry import Jobs
+from app.jobs.folders import JobFolders
+from app.jobs.job import Job, ended, job_fields
+from app.jobs.registry import Jobs, WrongJobState
 from app.storage.database import CannotStore, Store
 from osfcore.errors import UnknownName
 

@@ -3,7 +3,9 @@ from typing import get_args
 
 import pytest
 
-from app.jobs.job import Job, State, WrongJobState, check_file_name, check_params, ended, job_fields, job_from_fields
+from app.jobs.job import Job, State, check_file_name, ended, job_fields, job_from_fields
+from app.jobs.kinds import KINDS
+from app.jobs.registry import WrongJobState
 from osfcore.errors import InvalidInput, UnknownName
 from tests.support.errors import about
 
@@ -39,5 +41,5 @@ def test_orders_that_do_not_fit_say_so():
 @pytest.mark.parametrize("available", [0, 2])
 def test_more_objects_than_there_are_is_refused(available):
     with pytest.raises(InvalidInput, check=about("number of objects")):
-        check_params("collect_pushes", {"objects": 3}, str, available)
-    check_params("collect_pushes", {"objects": 2}, str, 2)
+        KINDS["collect_pushes"].check({"objects": 3}, str, available)
+    KINDS["collect_pushes"].check({"objects": 2}, str, 2)

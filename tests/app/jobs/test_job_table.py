@@ -1,7 +1,7 @@
 import pytest
 
 from app.jobs.job import Job, JobForgotten, ended
-from app.jobs.job_table import JobTable
+from app.jobs.table import JobTable
 from app.storage.database import CannotStore, Store
 from osfcore.errors import UnknownName
 

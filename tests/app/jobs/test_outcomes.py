@@ -3,9 +3,10 @@ from dataclasses import replace
 
 import pytest
 
+from app.jobs.context import JobCancelled
 from app.jobs.job import Job
-from app.jobs.outcomes import INTERRUPTED_NOTE, RESUMES_NOTE, JobDied, JobStopped, after
-from app.processes.messages.job_messages import JobCancelled
+from app.jobs.loop import INTERRUPTED_NOTE, RESUMES_NOTE, after
+from app.jobs.process import JobDied, JobStopped
 from osfcore.errors import OsfError
 
 REFUSED = OsfError("It is too large.")

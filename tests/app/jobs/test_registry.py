@@ -7,19 +7,11 @@ import time
 
 import pytest
 
-from app.jobs.clock import JobClock
+from app.jobs.context import CancelJob, JobCancelled, JobRests, JobStep, PauseJob, SceneCommand, StepJob
 from app.jobs.job import JobView
-from app.jobs.outcomes import INTERRUPTED_NOTE, RESUMES_NOTE, JobDied, JobStopped
+from app.jobs.loop import INTERRUPTED_NOTE, RESUMES_NOTE
+from app.jobs.process import JobClock, JobDied, JobStopped
 from app.jobs.registry import Jobs, QueueFull, WrongJobState
-from app.processes.messages.job_messages import (
-    CancelJob,
-    JobCancelled,
-    JobRests,
-    JobStep,
-    PauseJob,
-    SceneCommand,
-    StepJob,
-)
 from app.processes.messages.scene_messages import TakeImage
 from app.processes.process_server import InternalError
 from app.storage.database import CannotStore, Store
@@ -28,6 +20,8 @@ from osfcore.errors import UnknownName
 from tests.app.conftest import full_disk, newest_child, until
 
 TABLE = ("collect_table", {"images": 60, "size": 16, "seed": 0})
+EPISODE = {"scene": "s1", "names": [], "seed": 0, "settings": {}, "goal": {"id": None}}
+ESTIMATE = {"mode": "first", "names": [], "cameras": [], "of": {"scene": "s1"}}
 LONG = ("collect_table", {"images": 5000, "size": 16, "seed": 0})
 
 
@@ -401,7 +395,7 @@ def test_an_order_that_reaches_nobody_is_refused_and_changes_nothing(played, ope
 
 def begun(jobs, kind="episode"):
     """A job of which one step is done."""
-    job = jobs.submit(kind, {"scene": "s1"})
+    job = jobs.submit(kind, {"episode": EPISODE, "estimate": ESTIMATE}[kind])
     until_state(jobs, job, "running")
     (jobs.folder(job.id) / "report.json").write_text("{}")
     return job
@@ -552,8 +546,8 @@ def test_a_job_goes_on_while_the_disk_is_full_and_its_end_is_stored_once_there_i
 def test_a_stored_job_that_makes_no_sense_does_not_stop_the_start(played, open_jobs, store):
     store.save_job("a", 1, {"id": "a", "kind": "dance", "params": {}})
     store.save_job("b", 2, {"id": "b", "kind": "episode"})
-    store.save_job("c", 3, {"id": "c", "kind": "episode", "params": {}, "state": "dreaming"})
-    store.save_job("d", 4, {"id": "d", "kind": "episode", "params": {}, "state": "done", "mood": "added later"})
+    store.save_job("c", 3, {"id": "c", "kind": "episode", "params": EPISODE, "state": "dreaming"})
+    store.save_job("d", 4, {"id": "d", "kind": "episode", "params": EPISODE, "state": "done", "mood": "added later"})
     jobs, _ = open_jobs(start_process=played.start)
     (job,) = jobs.all()
     assert (job.id, job.state, job.files, job.note) == ("d", "done", (), "Waiting")

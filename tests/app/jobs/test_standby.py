@@ -5,7 +5,7 @@ import multiprocessing
 import pytest
 
 from app.jobs.job import Job
-from app.jobs.standby import Standby
+from app.jobs.process import Standby
 from tests.app.conftest import until
 
 

@@ -1,16 +1,15 @@
 import dataclasses
 from pathlib import Path
 from threading import Thread
+from typing import get_args
 
 import pytest
 
-from app.jobs.context import JobContext, JobControl
-from app.jobs.worker import KINDS, job_main, run_job
-from app.processes.child_process import launch
-from app.processes.messages.job_messages import (
+from app.jobs.context import (
     CancelJob,
     ChangeJob,
     JobCancelled,
+    JobControl,
     JobRests,
     JobStep,
     PauseJob,
@@ -19,9 +18,16 @@ from app.processes.messages.job_messages import (
     SceneCommand,
     StepJob,
 )
+from app.jobs.job import Job
+from app.jobs.kind import JobKind
+from app.jobs.kinds import KINDS, KindName, check_stored, in_words
+from app.jobs.loop import after
+from app.jobs.process import JobStopped
+from app.jobs.worker import job_main, run_job
+from app.processes.child_process import launch
 from app.processes.messages.scene_messages import TakeImage
 from app.processes.process_client import ProcessClient, ProcessUnavailable
-from app.processes.process_server import Answer, InternalError, child_main
+from app.processes.process_server import Answer, InternalError, Ready, child_main
 from app.processes.request_queue import Request
 from osfcore.errors import OsfError, UnknownName
 from tests.app.conftest import until
@@ -83,6 +89,14 @@ def test_a_job_whose_service_died_ends(data_dir, tmp_path):
     process, connection = launch(child_main, "job", job_main, "job")
     connection.send(Request(1, RunJob("collect_table", {**TABLE, "images": 5000}, data_dir, tmp_path)))
     while not isinstance(connection.recv(), JobStep):
+        pass
+    connection.close()
+    until(lambda: not process.is_alive())
+
+
+def test_a_process_in_reserve_ends_with_its_service():
+    process, connection = launch(child_main, "job", job_main, "job", True)
+    while not isinstance(connection.recv(), Ready):
         pass
     connection.close()
     until(lambda: not process.is_alive())
@@ -173,7 +187,7 @@ def run(monkeypatch, steps, orders=()):
         if isinstance(message, JobRests):
             control.take(ResumeJob())
 
-    monkeypatch.setitem(KINDS, "played", lambda *_: (step for step in steps))
+    monkeypatch.setitem(KINDS, "played", JobKind("played", "play", lambda *_: (step for step in steps)))
     outcome = run_job(RunJob("played", {}, Path("d"), Path("f")), control, send, float("inf"))
     return told, outcome
 
@@ -197,18 +211,23 @@ def test_a_job_tells_that_it_rests_where_a_round_ends_and_only_then(monkeypatch)
     assert [type(message) for message in told] == [JobStep, JobStep, JobRests, JobStep, JobStep]
 
 
-def test_every_kind_that_rest_tells_of_exists():
-    assert set(KINDS) == {
-        "collect_pushes",
-        "collect_object",
-        "collect_table",
-        "fetch_assets",
-        "add_object",
-        "train_field",
-        "clip",
-        "estimate",
-        "episode",
-        "photo",
-        "robot",
-    }
-    assert JobContext(Path("d"), Path("f")).library.root == Path("d/objects")
+def test_every_kind_that_can_be_asked_for_has_a_record():
+    assert list(KINDS) == list(get_args(KindName))
+
+
+def test_a_kind_of_job_is_one_record(monkeypatch, tmp_path):
+    """What a record says is enough for the service to run such a job and to bring it to its end."""
+
+    def count(params, place):
+        for done in range(1, params["to"] + 1):
+            yield Told(done, True)
+
+    monkeypatch.setitem(KINDS, "count", JobKind("count", "counting", count, keeps_steps=True))
+    told = []
+    outcome = run_job(RunJob("count", {"to": 3}, tmp_path, tmp_path), JobControl(told.append), told.append)
+    assert [step.done for step in told] == [1, 2, 3]
+    running = Job("a", "count", {"to": 3}, "running")
+    check_stored(running)
+    assert in_words(running) == "counting"
+    assert after(running, outcome, tmp_path).state == "done"
+    assert after(running, JobStopped(), tmp_path).state == "interrupted"

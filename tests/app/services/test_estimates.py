@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.jobs.folders import JobFolders
 from app.jobs.job import Job, JobPage
-from app.jobs.job_folders import JobFolders
 from app.jobs.kinds.estimates import STATE
 from app.services.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, errors_of
 from app.services.fields import FieldCatalogue, MissingFields

@@ -9,10 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from app.jobs.job import JobChanged, SceneNeeded, TrainingAlready
+from app.jobs.job import JobChanged
 from app.processes.messages.scene_messages import DropScene, SceneChanged, TakeImage
 from app.services.event_hub import CurrentScene, Notice
-from app.services.runner import DemoScene, Runner
+from app.services.runner import DemoScene, Runner, SceneNeeded, TrainingAlready
 from app.services.scenes import SceneHeld, TooManyScenes
 from app.services.service_settings import Settings
 from app.storage.database import CannotStore, Store

@@ -10,8 +10,8 @@ from PIL import Image
 
 from app.episodes.file_names import REPORT_FILE
 from app.episodes.robots.camera_files import write_pictures
-from app.jobs.clock import JobClock
-from app.processes.messages.job_messages import JobCancelled, JobStep
+from app.jobs.context import JobCancelled, JobStep
+from app.jobs.process import JobClock
 from app.services import runner
 from app.services.robots import robot_table
 from osfcore.contrib.robots.robot import ConnectionLost

@@ -15,11 +15,11 @@ from app.episodes.file_names import (
     TRAJECTORY_FILE,
     VIDEO_FILE,
 )
-from app.jobs.context import JobContext, JobControl
+from app.jobs.context import JobContext, JobControl, RunJob
 from app.jobs.job import INPUTS
+from app.jobs.kinds import KINDS
 from app.jobs.kinds.episodes import EpisodeProgress, episode_job, settings_of
-from app.jobs.worker import KINDS, run_job
-from app.processes.messages.job_messages import RunJob
+from app.jobs.worker import run_job
 from app.processes.plan_summary import PlanSketch
 from osfcore.control import estimators
 from osfcore.control.events import ActionExecuted, EpisodeSettings, Looking, Observed, Planning, Stepped
@@ -130,7 +130,9 @@ def test_what_a_view_must_not_miss_says_so(place, stage, sighted):  # noqa: F811
 def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
     told = []
     steps = [EpisodeProgress(1, 2, "Pushing", 0.5, 9.0, stage="act", steps=1, seconds=31.0)]
-    monkeypatch.setitem(KINDS, "episode", lambda _params, _place: (step for step in steps))
+    monkeypatch.setitem(
+        KINDS, "episode", replace(KINDS["episode"], run=lambda _params, _place: (step for step in steps))
+    )
     run_job(RunJob("episode", {}, place.data_dir, place.folder), JobControl(told.append), told.append)
     assert told[0].result == {
         "share": 0.5, "left_s": 9.0, "stage": "act", "steps": 1, "seconds": 31.0, "outcome": None, "text": None,

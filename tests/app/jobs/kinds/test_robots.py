@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from app.episodes.file_names import GOAL_FILE
-from app.jobs.context import JobControl
+from app.jobs.context import CancelJob, ChangeJob, JobCancelled, JobControl, RunJob
 from app.jobs.job import INPUTS
 from app.jobs.worker import run_job
-from app.processes.messages.job_messages import CancelJob, ChangeJob, JobCancelled, RunJob
 from osfcore.contrib.robots.connect import connect
 from osfcore.contrib.robots.robot import ConnectionLost, RobotRefused, RobotStopped
 from osfcore.io.image_file import write_png
@@ -67,6 +66,18 @@ def test_it_waits_for_permission_and_then_does_its_steps(robot, tmp_path):
     assert (tmp_path / "job" / "report.json").is_file()
     with contextlib.closing(connect(robot[0])) as again, pytest.raises(RobotRefused):
         again.act(np.zeros(3))
+
+
+@pytest.mark.parametrize("change", [{"settings": {"steps": 3}}, {"allowed": False}, {"allowed": "no"}])
+def test_no_other_change_of_parameters_is_a_permission(robot, tmp_path, change):
+    before, job = robot[1].truth().pusher, Driven(robot[0], tmp_path)
+    job.told("asked")
+    job.control.take(ChangeJob(change))
+    until(lambda: job.outcome is not None or [step.result["drives"] for step in job.steps][-2:] != ["looking", "asked"])
+    assert job.steps[-1].result["drives"] == "asked"
+    job.control.take(CancelJob())
+    assert isinstance(job.end(), JobCancelled)
+    np.testing.assert_array_equal(robot[1].truth().pusher, before)
 
 
 def test_cancelled_while_it_asks_nothing_has_moved(robot, tmp_path):

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from app.jobs.job import INPUTS
-from app.storage.schema import CannotStore
+from app.storage.database import CannotStore
 from osfcore.io.files import put_in_place
 
 _TEMPORARY_PREFIX = ".new-"

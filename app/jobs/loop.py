@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -12,16 +13,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from app.jobs.context import JobCancelled, JobRests, JobStep, SceneCommand
+from app.jobs.folders import JobFolders, remove_half_made
 from app.jobs.job import Job, JobChanged, JobView, ended
-from app.jobs.job_folders import JobFolders
-from app.jobs.job_process import JobProcess
-from app.jobs.job_table import JobTable
-from app.jobs.outcomes import JobStopped, Outcome, after
-from app.processes.messages.job_messages import JobCancelled, JobRests, JobStep, SceneCommand
+from app.jobs.kinds import KINDS
+from app.jobs.process import JobDied, JobProcess, JobStopped, Outcome
+from app.jobs.table import JobTable
 from app.processes.messages.scene_messages import Command
 from app.processes.process_server import Answer, InternalError
 from app.storage.database import now_utc
-from app.storage.field_files import clear_workshop
 from osfcore.errors import OsfError, UnknownName
 from osfcore.io.files import sync_tree
 
@@ -105,7 +105,7 @@ class JobLoop:
 
     def _begin(self, job: Job) -> None:
         folder = self._folders.folder(job.id)
-        if job.kind != "fetch_assets":
+        if KINDS[job.kind].has_folder:
             folder.mkdir(parents=True, exist_ok=True)
         self.run = self._start_process(job, self._data_dir, folder, self._on_event)
         self._table.set(replace(job, state="running", started_at=now_utc(), note="Starting"))
@@ -133,7 +133,7 @@ class JobLoop:
             outcome = JobCancelled()  # whatever ended it first, it was asked to
         then = after(job, outcome, self._folders.folder(job.id))
         if then.state == "cancelled":
-            forget_workshop(self._data_dir, self._table, job)
+            clear_cancelled(self._data_dir, self._table, job)
         if then.state == "done":
             with contextlib.suppress(OSError):
                 sync_tree(self._folders.folder(job.id))  # before anybody is told that it is there
@@ -195,10 +195,42 @@ class JobLoop:
             self._table.set(replace(self._table[run.id], state="paused", eta_s=None))
 
 
-def forget_workshop(data_dir: Path, table: JobTable, job: Job) -> None:
-    """Remove what a cancelled training would find at its next try, unless another works there."""
-    if job.kind != "train_field":
-        return
-    name = job.params["name"]
-    if not any(other.id != job.id and other.params["name"] == name for other in table.live(job.kind)):
-        clear_workshop(data_dir, name)
+def clear_cancelled(data_dir: Path, table: JobTable, job: Job) -> None:
+    """Remove what a cancelled job has left outside its folder."""
+    others = [other for other in table.live(job.kind) if other.id != job.id]
+    KINDS[job.kind].on_cancelled(data_dir, job, others)
+
+
+# How jobs end: what each outcome makes of a job, and what is left of its folder.
+
+
+RESUMES_NOTE = "Started again with the same settings, it goes on from its last checkpoint."
+INTERRUPTED_NOTE = "The service stopped in the middle; the steps until then are kept."
+
+
+def after(job: Job, outcome: Outcome, folder: Path) -> Job:
+    """The job as its process left it; the folder of one that came to nothing is removed.
+
+    Args:
+        job: as it was while it ran.
+        outcome: its result, or why there is none.
+        folder: of the job; of what stays, half-made files go and the others are listed.
+    """
+    kind = KINDS[job.kind]
+    if isinstance(outcome, dict):
+        then = ended(job, "done", note="Done", result=outcome)
+    elif isinstance(outcome, JobCancelled):
+        then = ended(job, "cancelled", note="Cancelled")
+    elif isinstance(outcome, JobStopped) and kind.keeps_steps:
+        then = ended(job, "interrupted", note="Interrupted", error=INTERRUPTED_NOTE)
+    else:
+        can_resume = kind.goes_on and isinstance(outcome, JobStopped | JobDied)
+        then = ended(job, "failed", note="Failed", error=f"{outcome} {RESUMES_NOTE}" if can_resume else str(outcome))
+    if then.state != "done":
+        then = kind.on_broken_off(then, folder)
+    if then.state != "done" and not kind.keeps_steps:
+        shutil.rmtree(folder, ignore_errors=True)
+        return then
+    remove_half_made(folder)
+    files = tuple(sorted(path.name for path in folder.glob("[!.]*") if path.is_file()))
+    return replace(then, files=files)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.job import Job, JobChanged, JobEvent, JobForgotten, JobPage, job_fields, job_from_fields
+from app.jobs.kinds import check_stored
 from app.storage.database import Store
 from app.storage.paths import without_places
 from osfcore.errors import NotThere
@@ -27,14 +28,10 @@ class JobTable:
         store: where they are kept.
         data_dir: whose place what is told of jobs does not name.
         publish: told of every change; progress is thinned out.
-        check: raises an error for a stored job that this version can do nothing with.
     """
 
-    def __init__(
-        self, store: Store, data_dir: Path, publish: Callable[[JobEvent], None], check: Callable[[Job], object] = id
-    ) -> None:
+    def __init__(self, store: Store, data_dir: Path, publish: Callable[[JobEvent], None]) -> None:
         self._store = store
-        self._check = check
         self._data_dir = data_dir
         self._publish = publish
         self._jobs: dict[str, Job] = {}
@@ -44,13 +41,8 @@ class JobTable:
 
     def load(self) -> None:
         """Take over what the store holds."""
-        for number, job in self._store.jobs(self._readable):
+        for number, job in self._store.jobs(_readable):
             self._jobs[job.id], self._numbers[job.id] = job, number
-
-    def _readable(self, fields: dict[str, Any]) -> Job:
-        job = job_from_fields(fields)
-        self._check(job)
-        return job
 
     def __getitem__(self, job: str) -> Job:
         """One job as it is stored."""
@@ -173,3 +165,9 @@ class JobTable:
             job.id, number, job_fields(job), job_fields(shown), can_wait=True
         )
         self._publish(JobChanged(event, shown))
+
+
+def _readable(fields: dict[str, Any]) -> Job:
+    job = job_from_fields(fields)
+    check_stored(job)
+    return job

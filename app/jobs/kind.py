@@ -1,0 +1,65 @@
+"""What the service must know of a kind of job, in one record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from osfcore.io.json_codec import Entry
+
+if TYPE_CHECKING:
+    from app.jobs.context import JobContext
+    from app.jobs.job import Job
+
+Params = dict[str, Any]
+
+
+def _refuse_nothing(params: Params, check_object: Callable[[str], object], available: int) -> None:
+    pass
+
+
+def _leave_nothing(data_dir: Path, job: Job, others: Sequence[Job]) -> None:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class JobKind:
+    """A kind of job.
+
+    Attributes:
+        name: as it is asked for over REST and stored.
+        words: what it is called for people.
+        run: does it in the job's process, step by step: each step has `done`, `total` and `note`, and its other fields
+            are the job's result. A step may also have `view`, what the live view draws of it; `must_be_told`, if it
+            must reach the service however soon it comes; and `ends_round`, where a job that goes on by single steps
+            rests.
+        params: what parameters that were stored must hold for this version to show the job and go on with it.
+        check: refuses parameters at once that `run` would refuse later, given a function that raises an OsfError for
+            the name of an object that cannot be used, and how many objects there are.
+        preloads: modules that a process in reserve has loaded before it is asked for such a job; none if no process
+            is kept in reserve for it.
+        uses_physics: whether its process loads the simulator first.
+        has_folder: whether it has a folder of its own for what it makes.
+        keeps_steps: whether the steps that it has finished are kept when it is broken off.
+        goes_on: whether the same order goes on from a checkpoint after it was broken off.
+        ends_at_once: whether it leaves nothing that it must tidy up when it is cancelled.
+        on_cancelled: removes what it has left outside its folder when it is cancelled, given the data directory, the
+            job, and the other jobs of this kind that wait, run or pause.
+        on_broken_off: returns the job as it is when it has ended in any way but well, given its folder.
+    """
+
+    name: str
+    words: str
+    run: Callable[[Params, JobContext], Iterator[Any]]
+    params: type[Entry] = Entry
+    check: Callable[[Params, Callable[[str], object], int], None] = _refuse_nothing
+    preloads: tuple[str, ...] = ()
+    uses_physics: bool = False
+    has_folder: bool = True
+    keeps_steps: bool = False
+    goes_on: bool = False
+    ends_at_once: bool = False
+    on_cancelled: Callable[[Path, Job, Sequence[Job]], None] = _leave_nothing
+    on_broken_off: Callable[[Job, Path], Job] = lambda job, _: job
