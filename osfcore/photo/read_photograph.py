@@ -68,7 +68,7 @@ class RawPhotograph:
         return ((self.encoded.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
-def read_photograph(data: bytes | Path, *, encoding: Encoding = "srgb") -> RawPhotograph:
+def read_photograph(data: bytes | Path, *, encoding: Encoding = "srgb", most_pixels: int = MAX_PIXELS) -> RawPhotograph:
     """Read a photo in any usual format, upright, no side longer than 2048 px.
 
     Grey, palettes, CMYK and 16 bits a channel (which PNG and grey TIFF keep) are understood; what is transparent
@@ -77,18 +77,19 @@ def read_photograph(data: bytes | Path, *, encoding: Encoding = "srgb") -> RawPh
     Args:
         data: the file, or its content.
         encoding: what its values mean.
+        most_pixels: that it may have.
 
     Raises:
         CorruptFile: if it is no such image, is broken, or has too many or too few pixels.
     """
     name, content = ("The photo", data) if isinstance(data, bytes) else (shown(data), content_of(data, data, MAX_BYTES))
-    allowed = f"{MAX_PIXELS // 1_000_000} million are allowed"
+    allowed = f"{most_pixels // 1_000_000} million are allowed"
     try:
         with _without_warnings(), _opened(name, content) as image:
             width, height = image.size
-            if width * height > 2 * MAX_PIXELS:
+            if width * height > 2 * most_pixels:
                 raise CorruptFile(name, f"it has far too many pixels; {allowed}")
-            if width * height > MAX_PIXELS:
+            if width * height > most_pixels:
                 raise CorruptFile(name, f"it has {width} x {height} pixels; {allowed}")
             if min(width, height) < MIN_SIDE:
                 raise CorruptFile(name, f"it has {width} x {height} pixels; at least {MIN_SIDE} a side are needed")

@@ -49,7 +49,7 @@ class StandIn:
         self.pictures = dict.fromkeys(cameras, jpeg(np.full((SIDE, SIDE, 3), 100, np.uint8)))
         self.twists, self.frames, self.silent = [], [], set()
         self.last_twist = 0.0
-        self.extra = {}
+        self.extra, self.noise = {}, []
         self._ends = threading.Event()
         self._sockets = []
 
@@ -97,6 +97,8 @@ class StandIn:
     def _speak(self, connection, asked):
         once = set()
         with contextlib.suppress(ConnectionClosed, OSError):
+            for text in self.noise:
+                connection.send(text)
             while connection in self._sockets and not self._ends.is_set():
                 for topic, message in self.messages().items():
                     if topic in asked and topic not in once:

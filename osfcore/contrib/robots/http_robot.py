@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import json
+import asyncio
+import contextlib
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from pydantic import Field, FiniteFloat
 
-from osfcore.contrib.robots.robot import ConnectionLost, RobotDescription, RobotRefused, SafetyLimits
+from osfcore.contrib.robots.robot import (
+    ANSWER_S,
+    MOST_JSON_BYTES,
+    MOST_PICTURE_BYTES,
+    ConnectionLost,
+    RobotDescription,
+    RobotRefused,
+    SafetyLimits,
+    parse_json,
+)
 from osfcore.errors import InvalidInput, OsfError, shown
 from osfcore.estimation.camera_response import linear_from_encoded
 from osfcore.geometry.cameras import Camera
@@ -31,6 +41,7 @@ from osfcore.photo.read_photograph import read_photograph
 # From encoded pictures of a robot's cameras to linear radiance of moderate size, as an `Observation` holds it.
 
 KEPT_SIDE = 640  # larger pictures are reduced to this; estimates look at less
+_DETAIL_CHARACTERS = 300  # of a robot's reason for a refusal
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -71,10 +82,10 @@ class SentCamera:
         """Decode a JPEG or PNG file of this camera, sRGB, into linear radiance as `kept` sees it.
 
         Raises:
-            CorruptFile: if it is no such file.
+            CorruptFile: if it is no such file, or has more pixels than any camera may have.
             InvalidInput: if it has another size than was described.
         """
-        encoded = read_photograph(picture).encoded
+        encoded = read_photograph(picture, most_pixels=MOST_SIDE**2).encoded
         return self._resample(linear_from_encoded(encoded / np.iinfo(encoded.dtype).max, "srgb").astype(np.float32))
 
     def mask(self, picture: bytes) -> Bool[np.ndarray, "h w"]:
@@ -83,7 +94,10 @@ class SentCamera:
         Raises:
             CorruptFile, InvalidInput: as `radiance`.
         """
-        return self._resample(read_photograph(picture).eight_bit[..., 0].astype(np.float32)) > 127
+        return (
+            self._resample(read_photograph(picture, most_pixels=MOST_SIDE**2).eight_bit[..., 0].astype(np.float32))
+            > 127
+        )
 
     def _resample(self, image: np.ndarray) -> np.ndarray:
         """Undistort an image and reduce it to the size of `kept`."""
@@ -159,7 +173,7 @@ class HttpRobot:
     Args:
         url: its address, such as http://192.168.0.7:8080.
         names: of the objects on the table, given by a person.
-        timeout_s: how long an answer may take beyond the time that a motion takes [s].
+        timeout_s: how long an answer may take, to its last byte and beyond the time that a motion takes [s].
 
     Raises:
         ConnectionLost: if nobody answers.
@@ -167,13 +181,22 @@ class HttpRobot:
         InvalidInput: if its description is out of range.
     """
 
-    def __init__(self, url: str, names: tuple[str, ...], timeout_s: float = 5.0) -> None:
-        self._url, self._names = url.rstrip("/"), names
-        # Names of proxies in the environment are not for a robot beside the computer.
-        self._http = httpx2.Client(timeout=timeout_s, trust_env=False)
-        self._idle, self._under_way = threading.Condition(), 0
+    def __init__(self, url: str, names: tuple[str, ...], timeout_s: float = ANSWER_S) -> None:
+        self._url, self._names, self._timeout_s = url.rstrip("/"), names, timeout_s
+        # Timeouts of a synchronous client begin anew with every byte, so whoever sends few of them holds it for ever.
+        # Requests run in an event loop instead, where a time limits each as a whole.
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run_loop, name="robot over HTTP", daemon=True)
+        self._thread.start()
+        # Names of proxies in the environment are not for a robot beside the computer. What is not compressed is no
+        # larger than it seems. A connection is given up before a robot would close it just as a motion is sent.
+        self._http = httpx2.AsyncClient(
+            timeout=None, trust_env=False, headers={"Accept-Encoding": "identity"},
+            limits=httpx2.Limits(keepalive_expiry=2.0),
+        )  # fmt: skip
+        self._idle, self._under_way, self._is_closed = threading.Condition(), 0, False
         try:
-            answer = decode(RobotJson, self._json("GET", "robot"), f"answer of {self._url}/robot")
+            answer = decode(RobotJson, self._json("robot"), f"answer of {self._url}/robot")
             self._cameras = tuple(
                 SentCamera(c.name, rigid_pose(c.T_world_camera, c.name), np.array(c.K), c.width, c.height)
                 for c in answer.cameras
@@ -199,12 +222,15 @@ class HttpRobot:
             RobotRefused: if the robot refuses.
             CorruptFile, InvalidInput: if an answer is malformed.
         """
-        pusher = decode(PointJson, self._json("GET", "pusher"), f"answer of {self._url}/pusher").position
+        pusher = decode(PointJson, self._json("pusher"), f"answer of {self._url}/pusher").position
         pictures = self.pictures()
         sent = None
         if masks and self.description.masks.issuperset(self._names):
             keys = [(camera.name, name) for camera in self._cameras for name in self._names]
-            sent = {key: self._answer("GET", "masks/" + "/".join(map(_quoted, key))) for key in keys}
+            sent = {
+                key: self._answer("GET", "masks/" + "/".join(map(_quoted, key)), most=MOST_PICTURE_BYTES)
+                for key in keys
+            }
         seconds = time.monotonic() - self._began
         return observation_of(self._cameras, pictures, self._names, np.array(pusher), seconds, sent)
 
@@ -215,7 +241,8 @@ class HttpRobot:
             ConnectionLost: if nobody answers.
             RobotRefused: if the robot refuses.
         """
-        return tuple(self._answer("GET", f"images/{_quoted(camera.name)}") for camera in self._cameras)
+        paths = [f"images/{_quoted(camera.name)}" for camera in self._cameras]
+        return tuple(self._answer("GET", path, most=MOST_PICTURE_BYTES) for path in paths)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
         """Hold a velocity for 0.2 s; the robot answers when that is over.
@@ -226,56 +253,102 @@ class HttpRobot:
             RobotRefused: if the robot refuses, such as after a stop.
         """
         velocity = check_action(action)[:2].tolist()
-        self._json("POST", "act", {"velocity": velocity, "duration_s": STEP_S})
+        self._answer("POST", "act", {"velocity": velocity, "duration_s": STEP_S}, takes_s=STEP_S)
 
     def start(self) -> None:
         """Make ready to move."""
-        self._json("POST", "start")
+        self._answer("POST", "start")
 
     def stop(self) -> None:
         """Halt at once; from any thread, for a client has as many connections as it needs."""
-        self._json("POST", "stop")
+        self._answer("POST", "stop")
 
     def close(self) -> None:
         """Wait for requests under way, such as a stop from another thread, then release the sockets.
 
-        Timeouts bound the wait. Closing at once would abort a stop, or leak the socket of one that still connects.
+        Timeouts bound the wait. Closing at once would abort a stop. Calling it again does nothing.
         """
         with self._idle:
             self._idle.wait_for(lambda: not self._under_way)
-            self._http.close()
+            if self._is_closed:
+                return
+            self._is_closed = True
+        asyncio.run_coroutine_threadsafe(self._http.aclose(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
 
-    def _json(self, method: str, path: str, body: object = None) -> Any:  # noqa: ANN401
-        content = self._answer(method, path, body)
+    def _run_loop(self) -> None:
+        with contextlib.closing(self._loop):
+            self._loop.run_forever()
+
+    def _json(self, path: str) -> Any:  # noqa: ANN401
         try:
-            return json.loads(content or b"null")
+            return parse_json(self._answer("GET", path))
+        except OsfError:  # a ValueError itself
+            raise
         except ValueError:
-            raise RobotRefused(self._url, f"something that is no JSON to {method} /{path}") from None
+            raise RobotRefused(self._url, f"something that is no JSON to GET /{path}") from None
 
-    def _answer(self, method: str, path: str, body: object = None) -> bytes:
+    def _answer(
+        self, method: str, path: str, body: object = None, *, most: int = MOST_JSON_BYTES, takes_s: float = 0.0
+    ) -> bytes:
+        """Send a request and wait for the answer.
+
+        Args:
+            method: of HTTP.
+            path: below the robot's address.
+            body: what is sent as JSON.
+            most: bytes of the answer.
+            takes_s: what the robot needs for what is asked of it [s].
+
+        Raises:
+            ConnectionLost: if there is no whole answer in time.
+            RobotRefused: if the robot refuses, or says too much.
+        """
         with self._idle:
+            if self._is_closed:
+                raise ConnectionLost(self._url, "it was let go")
             self._under_way += 1
+        seconds = self._timeout_s + takes_s
+        asked = asyncio.run_coroutine_threadsafe(self._ask(method, path, body, most, seconds), self._loop)
         try:
-            answer = self._http.request(method, f"{self._url}/{path}", json=body)
-        except (httpx2.TransportError, httpx2.InvalidURL, RuntimeError) as error:  # RuntimeError once it is closed
+            status, content = asked.result()
+        except OsfError:  # a ValueError itself
+            raise
+        except TimeoutError:
+            raise ConnectionLost(self._url, f"no whole answer to {method} /{path} within {seconds:g} s") from None
+        except (httpx2.HTTPError, httpx2.InvalidURL, OSError, ValueError) as error:
             raise ConnectionLost(self._url, str(error) or type(error).__name__) from error
         finally:
+            asked.cancel()  # on an interruption by the keyboard
             with self._idle:
                 self._under_way -= 1
                 self._idle.notify_all()
-        if not answer.is_success:
-            raise RobotRefused(self._url, _detail(answer) or f"{answer.status_code} to {method} /{path}")
-        return answer.content
+        if not 200 <= status < 300:
+            raise RobotRefused(self._url, _detail(content) or f"{status} to {method} /{path}")
+        return content
+
+    async def _ask(self, method: str, path: str, body: object, most: int, seconds: float) -> tuple[int, bytes]:
+        """Return an answer's status and its content, as it is sent."""
+        url, content = f"{self._url}/{path}", bytearray()
+        async with asyncio.timeout(seconds), self._http.stream(method, url, json=body) as answer:
+            if answer.headers.get("Content-Encoding", "identity") != "identity":
+                raise RobotRefused(self._url, f"something compressed to {method} /{path}, which was not asked for")
+            async for chunk in answer.aiter_raw():
+                content += chunk
+                if len(content) > most:
+                    raise RobotRefused(self._url, f"more than {most // 1_000_000} MB to {method} /{path}")
+            return answer.status_code, bytes(content)
 
 
 def _quoted(name: str) -> str:
     return quote(name, safe="")
 
 
-def _detail(answer: httpx2.Response) -> str:
+def _detail(content: bytes) -> str:
     """Return the reason that an answer gives for a failure, or nothing."""
     try:
-        detail = answer.json()["detail"]
+        detail = parse_json(content)["detail"]
     except (ValueError, KeyError, TypeError):
         return ""
-    return detail if isinstance(detail, str) else ""
+    return shown(detail, _DETAIL_CHARACTERS) if isinstance(detail, str) else ""

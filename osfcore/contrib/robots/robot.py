@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from osfcore.control.world import World
-from osfcore.errors import InvalidInput, OsfError, check_ranges, finite_vector
+from osfcore.errors import InvalidInput, OsfError, check_ranges, check_unique, finite_vector
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.workspace import PUSHER_RADIUS_M, PUSHER_REACH_M, STEP_S
 
@@ -115,6 +117,34 @@ class Whereabouts:
         return Whereabouts(self.low + np.minimum(travel, 0), self.high + np.maximum(travel, 0))
 
 
+# What a robot may say, over HTTP and rosbridge alike. It may be broken, or no robot: whatever answers is not trusted.
+
+ANSWER_S = 5.0  # from a question to the last byte of its answer
+MOST_PICTURE_BYTES = 32_000_000  # a PNG of 2048 x 2048 pixels of 16 bits has 25 million
+MOST_JSON_BYTES = 1_000_000  # without texts: pictures may come as such
+MOST_CAMERAS = 16
+_MOST_NESTED = 32
+_TEXT = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"', re.DOTALL)
+
+
+def parse_json(content: str | bytes) -> Any:  # noqa: ANN401
+    """Parse JSON that takes neither much memory nor a deep stack, whatever it holds.
+
+    Raises:
+        ValueError: if it is malformed, too large or nested too deeply.
+    """
+    text = content if isinstance(content, str) else content.decode()
+    marks = _TEXT.sub("", text)
+    if len(marks) > MOST_JSON_BYTES:
+        raise ValueError("too large")
+    depth = 0
+    for bracket in re.finditer(r"[\[\]{}]", marks):
+        depth += 1 if bracket[0] in "[{" else -1
+        if depth > _MOST_NESTED:
+            raise ValueError("nested too deeply")
+    return json.loads(text)
+
+
 # What a robot offers besides a `World`: start and stop, a description, errors.
 
 LONGEST_DEADMAN_S = 1.0
@@ -178,12 +208,14 @@ class RobotDescription:
     masks: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        """Check the ranges.
+        """Check the ranges, and that the cameras can be told apart.
 
         Raises:
             InvalidInput: naming what is out of range.
         """
+        check_unique("cameras of the robot", [camera.name for camera in self.cameras], "each of another name")
         check_ranges(
+            ("number of the robot's cameras", len(self.cameras), 1, MOST_CAMERAS),
             ("radius of the robot's pusher [m]", self.pusher_radius_m, 0.002, 0.05),
             ("time after which the robot halts without a command [s]", self.deadman_s, STEP_S, LONGEST_DEADMAN_S),
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import contextlib
 import json
 import threading
@@ -21,8 +20,17 @@ from websockets.exceptions import ConnectionClosed, InvalidURI, WebSocketExcepti
 from websockets.sync.client import connect
 
 from osfcore.contrib.robots.http_robot import SentCamera, observation_of
-from osfcore.contrib.robots.robot import ConnectionLost, RobotDescription, RobotRefused, SafetyLimits
-from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName
+from osfcore.contrib.robots.robot import (
+    ANSWER_S,
+    MOST_JSON_BYTES,
+    MOST_PICTURE_BYTES,
+    ConnectionLost,
+    RobotDescription,
+    RobotRefused,
+    SafetyLimits,
+    parse_json,
+)
+from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, check_unique
 from osfcore.geometry.poses import Pose, unit_quaternion
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import STEP_S, check_action
@@ -113,7 +121,7 @@ def _plain(frame: str) -> str:
 # roslibpy speaks all of it, but through the reactor of Twisted, of which a process has one that cannot be started
 # twice: a lost connection could not be opened anew, nor closed without leaving its threads.
 
-_MOST_BYTES = 64_000_000  # of a message: a large picture is some megabytes in base64
+_MOST_BYTES = MOST_PICTURE_BYTES * 4 // 3 + MOST_JSON_BYTES  # of a message: pictures come in base64
 
 
 class Rosbridge:
@@ -138,7 +146,7 @@ class Rosbridge:
         except (OSError, TimeoutError, WebSocketException, InvalidURI) as error:
             raise ConnectionLost(url, str(error) or type(error).__name__) from error
         self._news = threading.Condition()
-        self._messages: dict[str, deque[Mapping[str, Any]]] = {}
+        self._messages: dict[str, deque[tuple[int, Mapping[str, Any]]]] = {}  # each with its size [bytes]
         self._counts: Counter[str] = Counter()
         self._lost = ""
         self._reader = threading.Thread(target=self._read, name="rosbridge", daemon=True)
@@ -151,7 +159,7 @@ class Rosbridge:
             topic: its name.
             kind: of its messages, such as sensor_msgs/msg/CameraInfo.
             every_ms: least time between two messages [ms].
-            kept: how many of the last messages are kept.
+            kept: how many of the last messages are kept, if they are not too large together.
         """
         self._messages[topic] = deque(maxlen=kept)
         # A queue of one holds the newest of what comes between two messages; without one (0) nothing is held.
@@ -172,7 +180,7 @@ class Rosbridge:
     def received(self, topic: str) -> tuple[Mapping[str, Any], ...]:
         """Return the kept messages of a topic, as rosbridge makes JSON of them, the newest last."""
         with self._news:
-            return tuple(self._messages[topic])
+            return tuple(message for _, message in self._messages[topic])
 
     def count(self, *topics: str) -> int:
         """Return how many messages of some topics have come so far."""
@@ -224,21 +232,24 @@ class Rosbridge:
         try:
             for text in self._socket:
                 self._take(text)
-        except (ConnectionClosed, OSError) as error:
+        except Exception as error:  # whatever it stumbles over, those who wait are not to wait in vain
             reason = str(error) or type(error).__name__
         with self._news:
             self._lost = reason
             self._news.notify_all()
 
     def _take(self, text: str | bytes) -> None:
-        """Keep a published message; others, such as a status, are not needed."""
+        """Keep a published message; others, such as a status, are not needed, nor what is no JSON of a usual size."""
         content = None
         with contextlib.suppress(ValueError):
-            content = json.loads(text)
+            content = parse_json(text)
         match content:
             case {"op": "publish", "topic": str(topic), "msg": dict(message)} if topic in self._messages:
                 with self._news:
-                    self._messages[topic].append(message)
+                    kept = self._messages[topic]
+                    kept.append((len(text), message))
+                    while len(kept) > 1 and sum(size for size, _ in kept) > MOST_JSON_BYTES:
+                        kept.popleft()
                     self._counts[topic] += 1
                     self._news.notify_all()
 
@@ -272,14 +283,15 @@ class RosNames:
     pusher: str = "pusher"
 
     def __post_init__(self) -> None:
-        """Check that there is a camera.
+        """Check that there are cameras, each of another name.
 
         Raises:
-            InvalidInput: if there is none.
+            InvalidInput: if not.
         """
         if not self.cameras or not all(self.cameras):
             given = ", ".join(self.cameras) or "missing"
             raise InvalidInput("cameras of the robot", given, "names of ROS, one or more")
+        check_unique("cameras of the robot", self.cameras, "each of another name")
 
     def topic(self, camera: str, below: str) -> str:
         """Return the full name of a camera's topic."""
@@ -315,7 +327,7 @@ class RosRobot:
     """
 
     def __init__(
-        self, url: str, topics: RosNames, names: tuple[str, ...], limits: SafetyLimits, timeout_s: float = 5.0
+        self, url: str, topics: RosNames, names: tuple[str, ...], limits: SafetyLimits, timeout_s: float = ANSWER_S
     ) -> None:
         self._url, self._topics, self._names, self._timeout_s = url, topics, names, timeout_s
         self._halted = threading.Event()
@@ -331,11 +343,10 @@ class RosRobot:
                 self._bridge.subscribe(topic, "tf2_msgs/msg/TFMessage", kept=_TRANSFORMS_KEPT)
             self._bridge.send(op="advertise", topic=topics.twist, type="geometry_msgs/msg/TwistStamped")
             self._cameras = self._described_cameras()
-            cameras = tuple(camera.kept() for camera in self._cameras)
+            self.description = RobotDescription(tuple(camera.kept() for camera in self._cameras), limits)
         except OsfError:
             self._bridge.close()
             raise
-        self.description = RobotDescription(cameras, limits)
         self._began = time.monotonic()
 
     def reset(self, seed: int) -> Observation:
@@ -450,7 +461,8 @@ class RosRobot:
 
 
 def _picture(message: Mapping[str, object], topic: str) -> bytes:
+    data = decode(_Picture, message, f"message of {topic}").data
     try:
-        return base64.b64decode(decode(_Picture, message, f"message of {topic}").data, validate=True)
-    except binascii.Error:
+        return base64.b64decode(data, validate=True)
+    except ValueError:
         raise CorruptFile(topic, "its data are no base64") from None

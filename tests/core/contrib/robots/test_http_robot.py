@@ -1,4 +1,5 @@
 import contextlib
+import io
 import json
 import socket
 import threading
@@ -10,6 +11,7 @@ import httpx2
 import numpy as np
 import pytest
 from fastapi import FastAPI, Response
+from PIL import Image
 
 from osfcore.contrib.robots.connect import connect
 from osfcore.contrib.robots.guarded_world import GuardedWorld
@@ -124,13 +126,18 @@ def test_malformed_addresses_are_refused_and_what_does_not_answer_is_no_robot(se
 
 
 class Odd:
-    """A server whose answers can be spoilt."""
+    """A server whose answers can be spoilt: `robot` and `picture`, or any path's by another response."""
 
     def __init__(self, good):
-        self.good, self.robot, self.picture = good, good, b""
+        self.good, self.robot, self.picture, self.spoilt = good, good, b"", {}
 
     def app(self):
         app = FastAPI()
+
+        @app.middleware("http")
+        async def spoil(request, handle):
+            return self.spoilt.get(request.url.path) or await handle(request)
+
         app.get("/robot")(lambda: self.robot)
         app.get("/pusher")(lambda: {"position": [0.0, 0.0, 0.06]})
         app.get("/images/{name}")(lambda name: Response(self.picture))
@@ -142,6 +149,81 @@ def odd(server):
     one = Odd(httpx2.get(f"{server[0]}/robot").json())
     with serving(one.app()) as url:
         yield url, one
+
+
+@pytest.fixture
+def odd_robot(odd):
+    """A robot of sound description, whose other answers are spoilt; a machine may be as slow as it likes."""
+    odd[1].robot = odd[1].good
+    with contextlib.closing(HttpRobot(odd[0], NAMES, timeout_s=120.0)) as robot:
+        yield robot
+    odd[1].spoilt = {}
+
+
+DEEP = b"[" * 100_000 + b"]" * 100_000
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        Response(b"no gzip", headers={"Content-Encoding": "gzip"}),
+        Response(DEEP),
+        Response(b'{"position": ' + DEEP + b"}"),
+        Response(b'{"detail": ' + DEEP + b"}", 409),
+        Response(b"\xff", 500),
+        Response(b"0" * 40_000_000),
+    ],
+)
+def test_whatever_a_robot_answers_is_a_refusal(odd, odd_robot, answer):
+    odd[1].spoilt = dict.fromkeys(("/pusher", "/act", "/stop"), answer)
+    with pytest.raises(RobotRefused):
+        odd_robot.observe()
+    guard = GuardedWorld(odd_robot, FAST)
+    guard.stop("a key was pressed")
+    with pytest.raises(RobotStopped, check=about("a key was pressed")):
+        guard.check()
+
+
+def test_pictures_that_are_too_large_are_refused_before_they_are_decoded(odd, odd_robot):
+    odd[1].picture = b"0" * 33_000_000
+    with pytest.raises(RobotRefused, check=about("32 MB")):
+        odd_robot.observe()
+    large = io.BytesIO()
+    Image.new("1", (2048, 3000)).save(large, "PNG")
+    odd[1].picture = large.getvalue()
+    with pytest.raises(CorruptFile, check=about("2048 x 3000 pixels")):
+        odd_robot.observe()
+
+
+@contextlib.contextmanager
+def dripping(first):
+    """The address of a server that answers with these bytes, and then with one now and then, for ever."""
+    ends = threading.Event()
+
+    def drip(client):
+        with client, contextlib.suppress(OSError):
+            client.sendall(first)
+            while not ends.wait(0.02):
+                client.sendall(b"a")
+
+    def accept():
+        with contextlib.suppress(OSError):
+            while True:
+                threading.Thread(target=drip, args=server.accept()[:1]).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=accept)
+        thread.start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
+        ends.set()
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+@pytest.mark.parametrize("first", [b"HTTP/1.1 200 OK\r\nA: ", b"HTTP/1.1 200 OK\r\nContent-Length: 900000\r\n\r\n"])
+def test_an_answer_that_drips_is_not_waited_for(first):
+    with dripping(first) as url, pytest.raises(ConnectionLost, check=about("no whole answer")):
+        HttpRobot(url, NAMES, timeout_s=0.3)
 
 
 @pytest.mark.parametrize(
@@ -161,13 +243,22 @@ def test_a_robots_description_is_checked(odd, change, what):
         HttpRobot(url, NAMES)
 
 
-def test_damaged_pictures_are_refused(odd):
+def test_cameras_of_one_name_and_too_many_of_them_are_refused(odd):
     url, server = odd
-    server.robot = server.good
-    with contextlib.closing(HttpRobot(url, NAMES)) as robot:
-        for server.picture in (b"", b"no picture"):
-            with pytest.raises(CorruptFile):
-                robot.observe()
+    (camera, *_) = server.good["cameras"]
+    for cameras, what in (
+        ([camera] * 4, "cameras of the robot"),
+        ([camera | {"name": str(n)} for n in range(17)], "number of the robot's cameras"),
+    ):
+        server.robot = server.good | {"cameras": cameras}
+        with pytest.raises(InvalidInput, check=about(what)):
+            HttpRobot(url, NAMES)
+
+
+def test_damaged_pictures_are_refused(odd, odd_robot):
+    for odd[1].picture in (b"", b"no picture"):
+        with pytest.raises(CorruptFile):
+            odd_robot.observe()
 
 
 def test_closing_lets_a_stop_from_another_thread_arrive(odd):

@@ -126,13 +126,20 @@ def test_what_is_not_published_is_named(stand_in, topic, subject):
 
 def test_pictures_that_do_not_come_are_named_and_damaged_ones_refused(stand_in):
     with contextlib.closing(short(stand_in)) as robot:
-        for data in ("no base64", "QUJD"):
+        for data in ("no base64", "no ascii: \u00e4", "QUJD"):
             stand_in.extra["/left/image_raw/compressed"] = {"data": data}
             with pytest.raises(CorruptFile):
                 robot.observe()
         stand_in.silent.add("/right/image_raw/compressed")
         with pytest.raises(RobotRefused, check=about("/right/image_raw/compressed")):
             robot.observe()
+
+
+def test_messages_that_are_nested_too_deeply_or_no_json_are_passed_over(stand_in):
+    deep = "[" * 100_000 + "]" * 100_000
+    stand_in.noise = [deep, f'{{"op": "publish", "topic": "/tf", "msg": {{"transforms": {deep}}}}}', "{", "\u00e4"]
+    with contextlib.closing(connect(stand_in.url)) as robot:
+        assert robot.observe().images.shape[0] == 2
 
 
 def test_a_camera_that_is_not_calibrated_is_refused(stand_in):
@@ -143,7 +150,12 @@ def test_a_camera_that_is_not_calibrated_is_refused(stand_in):
 
 
 @pytest.mark.parametrize(
-    ("query", "subject"), [("", "cameras of the robot"), ("?cameras=a&colour=red", "part of a robot's address")]
+    ("query", "subject"),
+    [
+        ("", "cameras of the robot"),
+        ("?cameras=a,a", "cameras of the robot"),
+        ("?cameras=a&colour=red", "part of a robot's address"),
+    ],
 )
 def test_names_of_ros_come_with_the_address(query, subject):
     with pytest.raises((InvalidInput, UnknownName), check=about(subject)):
