@@ -16,23 +16,25 @@ from typing import Literal
 
 import viser
 
-from app.episodes.trajectory import read_trajectory
+from app.episodes.trajectory import LookFrame, Moment, ReplayClock, Round, Trajectory, read_trajectory
 from app.processes.process_client import ProcessClient
-from app.viewer.nodes.atomic import atomic
+from app.viewer.drawing import Panel
+from app.viewer.neural_panel import NeuralPanel
+from app.viewer.nodes.episode_nodes import EpisodeNodes
 from app.viewer.nodes.estimate_nodes import TRACKED
-from app.viewer.panels.neural_panel import NeuralPanel
-from app.viewer.panels.panel import Panel
-from app.viewer.replay_nodes import ROOT, ReplayNodes
+from app.viewer.nodes.room import atomic
+from app.viewer.nodes.scene_nodes import LAMP, LIVE_NODES, SceneNodes
 from osfcore.errors import OsfError
+from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.objects.asset_library import AssetLibrary
 
 DRAW_INTERVAL_S = 0.04
+_ROOT = "/replay"
 _TRACKED = f"/episode/estimate/{TRACKED}"
 _HIDDEN = {  # below the root of what is on view
     "meshes": (_TRACKED,), "fields": (_TRACKED,), "beliefs": ("/objects", "/shadows", "/names"),
 }  # fmt: skip
-_BY_PAGE = "page"
 Shows = Literal["meshes", "fields", "beliefs"]
 _MOST_PAGES = 200  # that are remembered; those that asked longest ago are forgotten
 _log = logging.getLogger(__name__)
@@ -68,24 +70,52 @@ class Wish:
     shows: Shows = "meshes"
 
 
+class _View:
+    """A browser that shows the view of a page. All but `client` belongs to the thread that draws.
+
+    Attributes:
+        client: the browser.
+        nodes: the replay that it shows in place of the live table.
+        shown: the file that they replay, and when it was last written.
+    """
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self.client = client
+        self.nodes: ReplayNodes | None = None
+        self.shown: tuple[Path, int] | None = None
+
+    def opened(self, trajectory: Path, library: AssetLibrary) -> ReplayNodes:
+        """Make the nodes for a trajectory, or keep them; an episode that goes on is read again once there is more."""
+        version = trajectory, trajectory.stat().st_mtime_ns
+        if self.nodes is None or self.shown is None or self.shown[0] != trajectory:
+            self.close()
+            self.nodes = ReplayNodes(self.client, library, read_trajectory(trajectory))
+        elif self.shown != version:
+            self.nodes.follow(read_trajectory(trajectory))
+        self.shown = version
+        return self.nodes
+
+    def close(self) -> None:
+        """Show the live table again."""
+        if self.nodes is not None:
+            self.nodes.remove()
+        self.nodes = self.shown = None
+
+
 @dataclass(slots=True)
 class _Page:
-    """A page's wish, and what its view shows of it.
+    """A page's wish, and its view.
 
     Attributes:
         wish: what it has asked for.
         since: when it asked, by the monotonic clock [s].
-        client: the browser's view, once it is open.
-        nodes: that replay.
-        shown: the file that they replay, and when it was last written.
+        view: once it is open; another one after each reload.
         is_due: whether there is something to draw.
     """
 
     wish: Wish = Wish()
     since: float = 0.0
-    client: viser.ClientHandle | None = None
-    nodes: ReplayNodes | None = None
-    shown: tuple[Path, int] | None = None
+    view: _View | None = None
     is_due: bool = False
 
 
@@ -116,113 +146,171 @@ class PageViews(Panel):
         self._page_of = page_of
         self._live = live
         self.neural = NeuralPanel(link, self.seen, fields, library.label)
-        self._pages: OrderedDict[str, _Page] = OrderedDict()  # guarded by `_thread.changed`, but for what is drawn
+        self._pages: OrderedDict[str, _Page] = OrderedDict()  # guarded by `_thread.changed`, the newest wish last
 
     def ask(self, page: str, wish: Wish) -> bool:
-        """Show an episode in a page's view, or the live table; tells whether the view is open. Any thread may call.
+        """Show an episode in a page's view, or the live table. Any thread may call.
+
+        Returns:
+            Whether the view is open.
 
         Raises:
             CorruptFile: if the trajectory cannot be read; then nothing changes.
         """
         if wish.replay is not None:
             read_trajectory(wish.replay.trajectory)
-        with self._thread.changed:
-            known = self._pages.setdefault(page, _Page())
-            self._pages.move_to_end(page)
+        with self._thread.changing():
+            known = self._page(page)
             if wish.replay != known.wish.replay:  # else only another look at it is wanted: what plays goes on
                 known.since = time.monotonic()
             known.wish, known.is_due = wish, True
-            idle = [name for name, one in self._pages.items() if one.client is None]
-            for name in idle[: max(len(self._pages) - _MOST_PAGES, 0)]:
-                del self._pages[name]
-            self._thread.wake()
-            return known.client is not None
+            return known.view is not None
 
     def add_client(self, client: viser.ClientHandle) -> None:
-        """A browser has opened the view of a page, perhaps once more."""
+        """Show what a page has asked for in the browser that has opened its view, perhaps once more."""
         page = self._page_of(client.client_id)
-        if page is None:
-            return
-        with self._thread.changed:
-            known = self._pages.setdefault(page, _Page())
-            known.client, known.nodes, known.shown, known.is_due = client, None, None, True
-            self._thread.wake()
+        if page is not None:
+            with self._thread.changing():
+                known = self._page(page)
+                known.view, known.is_due = _View(client), True
 
     def remove_client(self, client: viser.ClientHandle) -> None:
-        """A browser has closed it."""
+        """Forget a browser that has left; what its page has asked for is remembered."""
         with self._thread.changed:
             for known in self._pages.values():
-                if known.client is client:
-                    known.client = known.nodes = known.shown = None
+                if known.view is not None and known.view.client is client:
+                    known.view = None
 
     def seen(self, client: int) -> tuple[SceneState, str]:
-        """What a browser shows now, and the root of its nodes. Any thread may call."""
+        """Look up what a browser shows now, and the root of its nodes. Any thread may call."""
         with self._thread.changed:
             for page in self._pages.values():
-                if page.client is not None and page.client.client_id == client and page.nodes is not None:
-                    return page.nodes.state(), ROOT
+                if page.view is not None and page.view.client.client_id == client and page.view.nodes is not None:
+                    return page.view.nodes.state(), _ROOT
         return self._live(), ""
 
-    def _store(self, event: object) -> bool:
-        return False  # wishes come by `ask`
+    def _page(self, name: str) -> _Page:
+        """Remember a page, and no longer those without a view that were heard of longest ago."""
+        known = self._pages.setdefault(name, _Page())
+        self._pages.move_to_end(name)
+        idle = [other for other, page in self._pages.items() if page.view is None and page is not known]
+        for other in idle[: max(len(self._pages) - _MOST_PAGES, 0)]:
+            del self._pages[other]
+        return known
 
     def _draw(self) -> None:
         with self._thread.changed:
-            due = [(name, page) for name, page in self._pages.items() if page.is_due and page.client is not None]
-            for _, page in due:
+            due = [(name, page, page.view) for name, page in self._pages.items() if page.is_due and page.view]
+            for _, page, _ in due:
                 page.is_due = False
-        for name, page in due:
+        for name, page, view in due:
             try:
-                self._draw_at_once(page)
-            except Exception as error:  # the views of others go on
-                if isinstance(error, OsfError):
-                    _log.warning("a replay cannot go on: %s", error)
-                elif page.client is not None:  # else it has left in between
+                with atomic(view.client):  # live table and replay are never seen together
+                    self._draw_view(page, view)
+            except OsfError as error:
+                _log.warning("a replay cannot go on: %s", error)
+            except Exception:  # the views of others go on
+                if page.view is view:  # else it has left in between
                     _log.exception("the view of page %s failed", name)
 
-    def _draw_at_once(self, page: _Page) -> None:
-        """Draw in one change, so that live table and replay are never seen together."""
-        client = page.client
-        if client is not None:
-            with atomic(client):
-                self._draw_page(page, client)
-
-    def _draw_page(self, page: _Page, client: viser.ClientHandle) -> None:
-        wish, now = page.wish, time.monotonic()
+    def _draw_view(self, page: _Page, view: _View) -> None:
+        with self._thread.changed:
+            wish, since = page.wish, page.since
         if wish.replay is not None:
-            self._draw_replay(page, wish.replay, client, now)
-        elif page.nodes is not None:
-            self._close(page)
-        root = ROOT if wish.replay is not None else ""
-        hidden = self.neural.hidden(client.client_id)
+            self._draw_replay(page, view, wish.replay, time.monotonic() - since)
+        else:
+            view.close()
+        root, client = _ROOT if wish.replay is not None else "", view.client.client_id
+        hidden = self.neural.hidden(client)
         if hidden is not None:
-            hidden.hide(_BY_PAGE, {f"{root}{path}" for path in _HIDDEN[wish.shows]})
-        self.neural.switch(client.client_id, is_on=wish.shows == "fields")
-        self.neural.view_moved(client.client_id)
+            hidden.hide("page", {f"{root}{path}" for path in _HIDDEN[wish.shows]})
+        self.neural.switch(client, is_on=wish.shows == "fields")
+        self.neural.moved(client)
 
-    def _draw_replay(self, page: _Page, wish: Replay, client: viser.ClientHandle, now: float) -> None:
-        nodes = self._opened(page, wish, client)
-        played_s = wish.speed * (now - page.since) if wish.plays else 0.0
-        nodes.at(wish.at_s + played_s)
-        if wish.plays and wish.at_s + played_s < nodes.clock.length_s:
+    def _draw_replay(self, page: _Page, view: _View, wish: Replay, since_s: float) -> None:
+        nodes = view.opened(wish.trajectory, self._library)
+        at_s = wish.at_s + (wish.speed * since_s if wish.plays else 0.0)
+        nodes.at(at_s)
+        if wish.plays and at_s < nodes.clock.length_s:
             with self._thread.changed:
                 page.is_due = True
                 self._thread.wake(DRAW_INTERVAL_S)
 
-    @staticmethod
-    def _close(page: _Page) -> None:
-        """Back to the live table."""
-        if page.nodes is not None:
-            page.nodes.remove()
-        page.nodes = page.shown = None
 
-    def _opened(self, page: _Page, wish: Replay, client: viser.ClientHandle) -> ReplayNodes:
-        """The nodes for a wish; an episode that goes on is read again once there is more of it."""
-        version = wish.trajectory, wish.trajectory.stat().st_mtime_ns
-        if page.nodes is None or page.shown is None or page.shown[0] != wish.trajectory:
-            self._close(page)
-            page.nodes = ReplayNodes(client, self._library, read_trajectory(wish.trajectory))
-        elif page.shown != version:
-            page.nodes.follow(read_trajectory(wish.trajectory))
-        page.shown = version
-        return page.nodes
+class ReplayNodes:
+    """What one browser sees of a trajectory; the others go on seeing the live table. One thread at a time.
+
+    Args:
+        client: the browser.
+        library: meshes of the objects.
+        trajectory: of the episode, perhaps of one that goes on.
+    """
+
+    def __init__(self, client: viser.ClientHandle, library: AssetLibrary, trajectory: Trajectory) -> None:
+        self._client = client
+        # Invisible nodes of a browser's own take the places of those that all browsers see, with all below them.
+        self._hidden = [client.scene.add_frame(path, show_axes=False, visible=False) for path in LIVE_NODES]
+        # What is hidden as a whole needs a node of its own.
+        self._root, *_ = (client.scene.add_frame(f"{_ROOT}{path}", show_axes=False) for path in ("", "/objects"))
+        self._table = SceneNodes(client, library, root=_ROOT)
+        self._table.show_names(is_on=False)
+        self._episode = EpisodeNodes(client, library, self._table.names, root=f"{_ROOT}/episode")
+        client.scene.add_frame(f"{_ROOT}/episode/estimate/{TRACKED}", show_axes=False)
+        self._table.show(trajectory.states[0])
+        self.follow(trajectory)
+
+    @property
+    def clock(self) -> ReplayClock:
+        """When what is on view."""
+        return self._clock
+
+    def state(self) -> SceneState:
+        """Read what is on view."""
+        return self._table.state()
+
+    def follow(self, trajectory: Trajectory) -> None:
+        """Replay a longer trajectory of the same episode from now on."""
+        self._trajectory, self._clock = trajectory, ReplayClock(trajectory)
+        self._shown = Moment(-1.0)
+
+    def at(self, at_s: float) -> None:
+        """Show a moment [s]."""
+        moment, before = self._clock.moment(at_s), self._shown
+        if moment.action != before.action:
+            self._table.place(self._trajectory.state_at(moment.action))
+        if moment.look is not before.look:
+            self._show_look(moment.look)
+        if moment.estimate is not before.estimate:
+            self._show_estimate(moment.estimate)
+        if moment.plan is not before.plan:
+            self._episode.show_plan(None if moment.plan is None else moment.plan.plan)
+        if moment.plan is not None:
+            self._episode.play_to(moment.planned)
+        self._shown = moment
+
+    def remove(self) -> None:
+        """Show the live table again."""
+        lamp = self._client.scene.get_handle_by_name(LAMP)
+        for node in (self._root, *self._hidden, lamp):
+            if node is not None:
+                node.remove()
+
+    def _show_look(self, look: LookFrame | None) -> None:
+        if look is None:
+            self._episode.show_goal(self._goal())
+            return
+        if look.look == "first":
+            self._episode.show_goal({})
+        candidates = look.candidates if len(look.candidates.position) else None
+        self._episode.show_look(look.state, candidates, of_goal=look.look == "goal")
+
+    def _show_estimate(self, round_: Round | None) -> None:
+        if round_ is None:
+            self._episode.show_estimate(None)
+        else:
+            self._episode.show_estimate(round_.estimate.state, round_.estimate.doubts)
+            self._episode.show_goal(self._goal())
+
+    def _goal(self) -> dict[str, Pose]:
+        goal, names = self._trajectory.goal, self._trajectory.names
+        return {} if goal is None else {name: goal[n] for n, name in enumerate(names)}

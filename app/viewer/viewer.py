@@ -22,18 +22,16 @@ from app.services.goals.goals import DraftChanged, Goals
 from app.services.predictions import Predictions
 from app.services.runner import Runner
 from app.storage.paths import without_places
+from app.viewer.drawing import Panel, Playback
+from app.viewer.goal_panel import GoalPanel
+from app.viewer.job_panels import EpisodePanel, EstimatePanel
 from app.viewer.nodes.episode_nodes import EpisodeNodes
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.room import add_room
 from app.viewer.nodes.scene_nodes import Client, SceneNodes
 from app.viewer.page_views import PageViews
-from app.viewer.panels.episode_panel import EpisodePanel
-from app.viewer.panels.estimate_panel import EstimatePanel
-from app.viewer.panels.goal_panel import GoalPanel
-from app.viewer.panels.panel import Panel
-from app.viewer.panels.push_panel import PushPanel
-from app.viewer.playback import Playback
 from app.viewer.private_server import PrivateViser
+from app.viewer.push_panel import PushPanel
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
@@ -128,13 +126,12 @@ class Viewer:
         self._drawing.put_handles_back()
 
     def _make_panels(self, server: PrivateViser) -> tuple[Panel, ...]:
-        """The panels, in the order of their folders."""
+        """Make the panels, in the order of their folders."""
         library, table = self._runner.library, self._drawing
-        table.watch(self.pages.neural.scene_moved)
-        estimate = EstimatePanel(server, (table, EstimateNodes(server, library, table.names)))
+        table.watch(self.pages.neural.moved)
+        estimate = EstimatePanel(server, table, EstimateNodes(server, library, table.names))
         self._goal_panel = GoalPanel(server, library, self._goals, self._commands, self._run_command)
-        drawings = table, EpisodeNodes(server, library, table.names)
-        episode = EpisodePanel(server, drawings, estimate.forget)
+        episode = EpisodePanel(server, table, EpisodeNodes(server, library, table.names), estimate.forget)
         push = PushPanel(server, library, self._predictions, self._runner.act, self._run_command)
         return self.pages.neural, self.pages, estimate, self._goal_panel, episode, push
 

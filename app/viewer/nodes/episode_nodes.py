@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -11,16 +11,26 @@ import viser
 from jaxtyping import Float, UInt8
 
 from app.processes.plan_summary import PlanSketch
-from app.viewer.nodes.atomic import Target, atomic
-from app.viewer.nodes.estimate_nodes import Colour, EstimateNodes
-from app.viewer.nodes.future_nodes import FutureNodes
-from app.viewer.nodes.ghosts import mesh_of
-from app.viewer.nodes.label_layout import Label
-from app.viewer.nodes.push_nodes import PREDICTED
-from osfcore.control.events import Looking
-from osfcore.geometry.states import EstimatedState
+from app.viewer.nodes.estimate_nodes import EstimateNodes
+from app.viewer.nodes.ghosts import (
+    FINE_CELLS,
+    PREDICTED,
+    add_ghosts,
+    add_pusher_ghost,
+    along_way,
+    below_table,
+    between,
+    mesh_of,
+    move_ghosts,
+    moves,
+    pose_at,
+    way_of,
+)
+from app.viewer.nodes.room import NO_LINES, Colour, Label, Target, atomic
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.rollouts import Rollouts
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.objects.asset_library import AssetLibrary
-from osfcore.planning.costs import PoseGoal
 
 Part = Literal["goal", "plan", "estimate"]
 PARTS: tuple[Part, ...] = ("goal", "plan", "estimate")
@@ -28,12 +38,10 @@ GOAL = (245, 140, 0)
 CHEAP, DEAR = (45, 215, 90), (150, 62, 58)
 PLAY_S, REST_S = 2.0, 0.7  # how long the best future is played, and stands at its end
 _GAMMA = 2.2
-_CELLS = 28
 _GOAL_OPACITY = 0.5
 _GOAL_SCALE = 1.015  # or ghosts and the surfaces below them would flicker
 _WAY_M, _BEST_M = 0.0025, 0.007  # thickness
 _DEAREST_Z_M, _CHEAPEST_Z_M, _BEST_Z_M = 0.003, 0.006, 0.008  # cheap ways lie above dear ones
-_NOWHERE = np.zeros((1, 2, 3), np.float32)
 
 
 class EpisodeNodes:
@@ -66,12 +74,12 @@ class EpisodeNodes:
             server, library, names, root=f"{root}/goal/look", colour=_linear(GOAL), has_light=False
         )
         self._goal: dict[str, viser.MeshHandle] = {}
-        self._future = FutureNodes(server.scene, library, f"{root}/plan/future", _linear(PREDICTED))
+        self._future = FutureNodes(server.scene, library, f"{root}/plan/future")
         add = self._scene.add_line_segments
         # Lines that begin in one colour for all would stay white once each has its own.
         each = np.array([[_linear(CHEAP)] * 2], np.uint8)
-        self._ways = add(f"{root}/plan/ways", _NOWHERE, each, thickness=_WAY_M, visible=False)
-        self._best = add(f"{root}/plan/best", _NOWHERE, PREDICTED, thickness=_BEST_M, visible=False)
+        self._ways = add(f"{root}/plan/ways", NO_LINES, each, thickness=_WAY_M, visible=False)
+        self._best = add(f"{root}/plan/best", NO_LINES, PREDICTED, thickness=_BEST_M, visible=False)
 
     @property
     def shows_light(self) -> bool:
@@ -83,28 +91,46 @@ class EpisodeNodes:
         with self._lock:
             self._roots[part].visible = is_on
 
-    def show_goal(self, goal: PoseGoal | None) -> None:
-        """Show the target poses in place of the former ones, or none."""
+    def show_goal(self, poses: Mapping[str, Pose]) -> None:
+        """Show where objects should be in place of the former goal; of none, nothing."""
         with self._lock, atomic(self._server):
-            poses = {} if goal is None else {name: goal.pose(name) for name in goal.names}
             if set(poses) != set(self._goal):
-                _remove(self._goal)
-                self._goal = {name: self._goal_copy(name) for name in poses}
+                for node in self._goal.values():
+                    node.remove()
+                self._goal = {
+                    name: add_copy(
+                        self._scene, f"{self._root}/goal/where/{name}", self._library, name, opacity=_GOAL_OPACITY
+                    )
+                    for name in poses
+                }
             for name, pose in poses.items():
                 self._goal[name].position, self._goal[name].wxyz = pose.position, pose.quaternion
             self._goal_look.clear()
 
-    def show_look(self, look: Looking) -> None:
-        """Show an estimator at work, on the table or on the goal image."""
-        (self._goal_look if look.look == "goal" else self._now).show(look.step)
+    def show_look(
+        self,
+        state: SceneState,
+        candidates: Pose | None = None,
+        lights: np.ndarray | None = None,
+        estimate: EstimatedState | None = None,
+        *,
+        of_goal: bool = False,
+    ) -> None:
+        """Show an estimator at work, on the table or on the goal image; see `EstimateNodes.show`."""
+        (self._goal_look if of_goal else self._now).show(state, candidates, lights, estimate)
 
-    def show_estimate(self, estimate: EstimatedState | None) -> None:
-        """Show the estimated poses and light, or none."""
+    def show_estimate(self, state: SceneState | None, doubts: Sequence[str] = ()) -> None:
+        """Show the estimated poses and light, or none.
+
+        Args:
+            state: the estimate.
+            doubts: why each object is doubted, or "".
+        """
         with self._lock, atomic(self._server):
-            if estimate is None:
+            if state is None:
                 self._now.clear()
             else:
-                self._now.follow(estimate)
+                self._now.follow(state, doubts)
             self._goal_look.clear()
 
     def show_plan(self, sketch: PlanSketch | None) -> None:
@@ -129,7 +155,7 @@ class EpisodeNodes:
     def clear(self) -> None:
         """Remove everything."""
         with self._lock, atomic(self._server):
-            self.show_goal(None)
+            self.show_goal({})
             self.show_estimate(None)
             self.show_plan(None)
 
@@ -144,20 +170,22 @@ class EpisodeNodes:
         best[..., 2] = _BEST_Z_M
         self._best.points = _segments(best)
 
-    def _goal_copy(self, name: str) -> viser.MeshHandle:
-        return self._scene.add_mesh_simple(
-            f"{self._root}/goal/where/{name}",
-            *mesh_of(self._library, name, _CELLS),
-            color=GOAL,
-            opacity=_GOAL_OPACITY,
-            scale=_GOAL_SCALE,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+
+def add_copy(scene: viser.SceneApi, path: str, library: AssetLibrary, name: str, *, opacity: float) -> viser.MeshHandle:
+    """Add a golden copy of an object, which shows where it should be."""
+    return scene.add_mesh_simple(
+        path,
+        *mesh_of(library, name, FINE_CELLS),
+        color=GOAL,
+        opacity=opacity,
+        scale=_GOAL_SCALE,
+        cast_shadow=False,
+        receive_shadow=False,
+    )
 
 
 def cost_colours(costs: Float[np.ndarray, "W"]) -> UInt8[np.ndarray, "W 3"]:
-    """Colours of lines that cost more or less: the cheapest bright green, those of twice the median's surplus dim red.
+    """Colour lines by cost: the cheapest bright green, those of twice the median's surplus dim red.
 
     The dearest would be no measure: a single sequence that goes badly wrong would paint all others green.
     """
@@ -167,7 +195,7 @@ def cost_colours(costs: Float[np.ndarray, "W"]) -> UInt8[np.ndarray, "W 3"]:
 
 
 def _linear(colour: Colour) -> Colour:
-    """A colour for batches and for single points of lines: viser's client takes those for linear light."""
+    """Convert a colour for batches and for single points of lines: viser's client takes those for linear light."""
     red, green, blue = (round(255 * (channel / 255) ** _GAMMA) for channel in colour)
     return red, green, blue
 
@@ -176,6 +204,69 @@ def _segments(ways: Float[np.ndarray, "W T1 3"]) -> Float[np.ndarray, "S 2 3"]:
     return np.stack([ways[:, :-1], ways[:, 1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
 
 
-def _remove(nodes: Mapping[str, viser.SceneNodeHandle]) -> None:
-    for node in nodes.values():
-        node.remove()
+# The future that a plan predicts
+
+ON_THE_WAY = 3  # pale ghosts between now and the end
+_ARM_M = 0.05  # what turning by 1 rad counts on the way
+_OPACITY, _PALE = 0.45, 0.3  # the latter is a share of the former
+_SCALE = 1.008  # or ghosts and the surfaces below them would flicker
+
+
+class FutureNodes:
+    """One future of the objects that move in it: ghosts on the way, at its end, and moving with the pusher.
+
+    Args:
+        scene: to draw in.
+        library: meshes of the objects.
+        root: of its nodes.
+    """
+
+    def __init__(self, scene: viser.SceneApi, library: AssetLibrary, root: str) -> None:
+        self._scene = scene
+        self._library = library
+        self._root = root
+        self._future: Rollouts | None = None
+        self._ghosts: dict[str, viser.BatchedMeshHandle] = {}
+        self._pusher = add_pusher_ghost(scene, f"{root}/pusher")
+
+    @property
+    def steps(self) -> int:
+        """Actions until its end; 0 while none is shown."""
+        return 0 if self._future is None else len(self._future.pusher[0]) - 1
+
+    def show(self, future: Rollouts | None) -> None:
+        """Show the first of some rollouts, from its beginning, in place of the one before."""
+        self._future = future
+        self._pusher.visible = future is not None
+        if future is None:
+            for node in self._ghosts.values():
+                node.visible = False
+            return
+        if set(future.names) != set(self._ghosts):
+            for node in self._ghosts.values():
+                node.remove()
+            self._ghosts = {name: self._add_ghosts(name) for name in future.names}
+        for n, name in enumerate(future.names):
+            self._ghosts[name].visible = moves(way_of(future, n))
+        self.at(0.0)
+
+    def at(self, step: float) -> None:
+        """Move the ghosts that go along to where things are after some actions; in between, halfway."""
+        future = self._future
+        if future is None:
+            return
+        for n, name in enumerate(future.names):
+            if self._ghosts[name].visible:
+                poses = way_of(future, n)
+                now = pose_at(poses, step)
+                still = poses[[*along_way(poses, ON_THE_WAY, _ARM_M), -1]]
+                positions = np.vstack([still.position, now.position])
+                move_ghosts(self._ghosts[name], Pose(positions, np.vstack([still.quaternion, now.quaternion])))
+        self._pusher.position = between(future.pusher[0], step)
+
+    def _add_ghosts(self, name: str) -> viser.BatchedMeshHandle:
+        """Add ghosts of one object: on the way, at the end, and the one that goes."""
+        mesh, places = mesh_of(self._library, name, FINE_CELLS), below_table(ON_THE_WAY + 2)
+        shares = np.array([*[_PALE] * ON_THE_WAY, 1.0, 1.0])
+        path, colour = f"{self._root}/{name}", _linear(PREDICTED)
+        return add_ghosts(self._scene, path, mesh, places, colour, _OPACITY, scale=_SCALE, shares=shares)

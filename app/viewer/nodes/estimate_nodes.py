@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import viser
 
-from app.viewer.nodes.atomic import Target, atomic
 from app.viewer.nodes.ghosts import (
     Mesh,
     add_ghosts,
@@ -22,13 +21,11 @@ from app.viewer.nodes.ghosts import (
     spread,
     top_m,
 )
-from app.viewer.nodes.label_layout import Label, separated
-from app.viewer.nodes.light_marker import AT, LightMarker
-from app.viewer.nodes.scene_nodes import LIGHT_COLOUR
-from osfcore.estimation.steps import UNPLACED_BELOW_M, EstimateStep
+from app.viewer.nodes.room import AT, LIGHT_COLOUR, NO_TURN, Colour, Label, LightMarker, Target, atomic, separated
+from osfcore.estimation.steps import UNPLACED_BELOW_M
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import EstimatedState
+from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.objects.asset_library import AssetLibrary
 
 GHOSTS = 24  # candidates of each object that are drawn
@@ -44,7 +41,7 @@ _TABLE_M = 0.0015  # above it, so that it does not flicker
 _LABEL_M = 0.045
 _WIRES, _FAINT_WIRES = 0.9, 0.35  # opacity; things on their way are to be seen through them
 _WIRE_SCALE = 1.01  # or wires and the surface below them would flicker
-Colour = tuple[int, int, int]
+Copies = viser.BatchedMeshHandle
 
 
 class EstimateNodes:
@@ -77,43 +74,57 @@ class EstimateNodes:
         self._lock = threading.RLock()
         self._names: tuple[str, ...] = ()
         self._meshes: dict[str, Mesh] = {}
-        self._tried: dict[str, viser.BatchedMeshHandle] = {}
-        self._guesses: dict[str, viser.BatchedMeshHandle] = {}
-        self._tracked: dict[str, viser.BatchedMeshHandle] = {}
+        self._tried: dict[str, Copies] = {}
+        self._guesses: dict[str, Copies] = {}
+        self._tracked: dict[str, Copies] = {}
         self._verdicts: list[viser.SceneNodeHandle] = []
         self._has_candidates = True
         self._lamp: LightMarker | None = None
-        self._tried_lights = self._copies(f"{root}/tried_lights", box(_TRIED_LIGHT_M), GHOSTS, LIGHT_COLOUR, 0.5)
+        self._tried_lights = self._add_tried("tried_lights", box(_TRIED_LIGHT_M), LIGHT_COLOUR, 0.5)
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing is drawn."""
         return not self._names and self._lamp is None
 
-    def show(self, step: EstimateStep) -> None:
-        """Draw a step in place of the one before; the last one with its verdict."""
-        with self._lock, atomic(self._server):
-            if step.state.names != self._names:
-                self._begin(step.state.names)
-            self._clear_verdicts()
-            for n, name in enumerate(self._names):
-                self._show_guess(name, step.state.poses[n], is_tracked=False)
-                self._show_tried(name, None if step.candidates is None else step.candidates[:, n])
-            self._show_light(step.state.light, step.lights, "guessed light")
-            if step.estimate is not None:
-                self._judge(step.estimate)
+    def show(
+        self,
+        state: SceneState,
+        candidates: Pose | None = None,
+        lights: np.ndarray | None = None,
+        estimate: EstimatedState | None = None,
+    ) -> None:
+        """Draw an estimator at work in place of what was drawn before; its result with the verdict.
 
-    def follow(self, estimate: EstimatedState) -> None:
-        """Draw one of many estimates of things on their way: where they are, and which are doubted, without a word."""
+        Args:
+            state: the best scene so far.
+            candidates: poses that are tried, a (C, N) batch.
+            lights: directions toward the light that are tried, C x 3.
+            estimate: the result.
+        """
         with self._lock, atomic(self._server):
-            if estimate.state.names != self._names:
-                self._begin(estimate.state.names)
-            self._clear_verdicts()
-            for n, name in enumerate(self._names):
-                self._show_guess(name, estimate.state.poses[n], is_tracked=True)
+            self._begin(state.names)
+            for n, name in enumerate(state.names):
+                self._show_guess(name, state.poses[n], self._guesses, self._tracked)
+                self._show_tried(name, None if candidates is None else candidates[:, n])
+            self._show_light(state.light, lights, "guessed light")
+            if estimate is not None:
+                self._judge(estimate)
+
+    def follow(self, state: SceneState, doubts: Sequence[str]) -> None:
+        """Draw one of many estimates of things on their way: where they are, and which are doubted, without a word.
+
+        Args:
+            state: the estimate.
+            doubts: why each object is doubted, or "".
+        """
+        with self._lock, atomic(self._server):
+            self._begin(state.names)
+            for n, name in enumerate(state.names):
+                self._show_guess(name, state.poses[n], self._tracked, self._guesses)
                 self._show_tried(name, None)
-                self._mark(name, estimate.doubts[n])
-            self._show_light(estimate.state.light, None, "estimated light")
+                self._mark(name, doubts[n])
+            self._show_light(state.light, None, "estimated light")
 
     def show_candidates(self, is_on: bool) -> None:
         """Show or hide what is tried."""
@@ -126,44 +137,41 @@ class EstimateNodes:
         """Remove everything."""
         with self._lock, atomic(self._server):
             self._begin(())
-            self._clear_verdicts()
             if self._lamp is not None:
                 self._lamp.remove()
             self._lamp, self._tried_lights.visible = None, False
 
     def _begin(self, names: tuple[str, ...]) -> None:
+        """Make nodes for other objects than before, and remove the last verdict."""
+        for node in self._verdicts:
+            node.remove()
+        self._verdicts = []
+        for guess in (*self._guesses.values(), *self._tracked.values()):
+            guess.batched_colors = np.array(self._colour, np.uint8)
+        if names == self._names:
+            return
         for node in (*self._tried.values(), *self._guesses.values(), *self._tracked.values()):
             node.remove()
         self._names = names
         self._meshes = {name: mesh_of(self._library, name) for name in names}
-        self._tried = {name: self._copies(f"{self._root}/tried/{name}", self._meshes[name], GHOSTS) for name in names}
-        self._guesses, self._tracked = (
-            {
-                name: self._copies(f"{self._root}/{part}/{name}", self._meshes[name], 1, self._colour, opacity)
-                for name in names
-            }
-            for part, opacity in (("guess", _WIRES), (TRACKED, _FAINT_WIRES))
-        )
+        self._tried = {name: self._add_tried(f"tried/{name}", mesh) for name, mesh in self._meshes.items()}
+        self._guesses = {name: self._add_wires(f"guess/{name}", mesh, _WIRES) for name, mesh in self._meshes.items()}
+        self._tracked = {
+            name: self._add_wires(f"{TRACKED}/{name}", mesh, _FAINT_WIRES) for name, mesh in self._meshes.items()
+        }
 
-    def _copies(
-        self, path: str, mesh: Mesh, count: int, colour: Colour = _TRIED, opacity: float = 0.2
-    ) -> viser.BatchedMeshHandle:
-        is_wire = count == 1
+    def _add_tried(self, path: str, mesh: Mesh, colour: Colour = _TRIED, opacity: float = 0.2) -> Copies:
+        path = f"{self._root}/{path}"
+        return add_ghosts(self._scene, path, mesh, below_table(GHOSTS), colour, opacity, visible=False)
+
+    def _add_wires(self, path: str, mesh: Mesh, opacity: float) -> Copies:
+        path, place = f"{self._root}/{path}", below_table(1)
         return add_ghosts(
-            self._scene,
-            path,
-            mesh,
-            below_table(count),
-            batched_scales=np.full(count, _WIRE_SCALE if is_wire else 1.0),
-            batched_colors=colour,
-            wireframe=is_wire,
-            opacity=opacity,
-            side="double" if is_wire else "front",
-            visible=False,
+            self._scene, path, mesh, place, self._colour, opacity, scale=_WIRE_SCALE, is_wire=True, visible=False
         )
 
-    def _show_guess(self, name: str, pose: Pose, *, is_tracked: bool) -> None:
-        shown, hidden = (self._tracked, self._guesses) if is_tracked else (self._guesses, self._tracked)
+    @staticmethod
+    def _show_guess(name: str, pose: Pose, shown: Mapping[str, Copies], hidden: Mapping[str, Copies]) -> None:
         hidden[name].visible = False
         move_ghosts(shown[name], Pose(pose.position[None], pose.quaternion[None]))
         shown[name].visible = bool(pose.position[2] > UNPLACED_BELOW_M)
@@ -177,11 +185,11 @@ class EstimateNodes:
     def _show_light(self, light: Light, tried: np.ndarray | None, text: str) -> None:
         if not self._has_light:
             return
-        self._lamp = self._lamp or LightMarker(self._scene, f"{self._root}/light", LIGHT_COLOUR, is_below=True)
+        self._lamp = self._lamp or LightMarker(self._scene, f"{self._root}/light", is_below=True)
         self._lamp.place(light.position)
-        self._lamp.show(is_on=True, text=text)
+        self._lamp.show(text=text)
         if tried is not None:
-            turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(tried), 1))
+            turns = np.tile(NO_TURN, (len(tried), 1))
             move_ghosts(self._tried_lights, spread(Pose(AT * np.asarray(tried, float), turns), GHOSTS))
         self._tried_lights.visible = tried is not None and self._has_candidates
 
@@ -247,13 +255,6 @@ class EstimateNodes:
                 position=(pose.position[0], pose.position[1], _TABLE_M),
             ),
         ]
-
-    def _clear_verdicts(self) -> None:
-        for node in self._verdicts:
-            node.remove()
-        self._verdicts = []
-        for guess in (*self._guesses.values(), *self._tracked.values()):
-            guess.batched_colors = np.array(self._colour, np.uint8)
 
 
 def _two_digits(value: float) -> str:

@@ -1,41 +1,32 @@
-"""Geometry of estimates and predictions: coarse meshes for copies, sectors for orientations, cubes for lights."""
+"""Translucent copies of objects: coarse meshes, places on a way, and shapes that say how sure a pose is."""
 
 from __future__ import annotations
 
 import logging
-from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 import viser
 from jaxtyping import Float, Int
 
+from app.viewer.nodes.room import NO_TURN, Colour
 from osfcore.errors import OsfError
-from osfcore.geometry.poses import Pose, rotate
+from osfcore.geometry.poses import Pose, rotate, rotation_angle
 from osfcore.geometry.rollouts import Rollouts
+from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.objects.asset_library import AssetLibrary
 
-CELLS = 14  # along the longest side of an object; a ghost has some hundred triangles
+CELLS, FINE_CELLS = 14, 28  # along the longest side of an object; a coarse ghost has some hundred triangles
+PREDICTED, TRUE = (190, 50, 210), (25, 25, 25)  # neither is a colour of estimates
+UNKNOWN_M = 0.05  # the side of the cube for an object without a mesh
 _ARC_STEPS = 24
-_UNKNOWN_M = 0.05
-_MOVED_M, _TURNED = 5e-4, 1e-3
+_PUSHER_SCALE, _PUSHER_OPACITY = 1.01, 0.35
+MOVED_M, _TURNED = 5e-4, 1e-3
 _log = logging.getLogger(__name__)
 Mesh = tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 3"]]
 
 
-class GhostStyle(TypedDict, total=False):
-    """Arguments of viser's `add_batched_meshes_simple` that differ among copies of meshes."""
-
-    batched_scales: Float[np.ndarray, "N"]
-    batched_colors: tuple[int, int, int]
-    batched_opacities: Float[np.ndarray, "N"]
-    opacity: float
-    wireframe: bool
-    side: Literal["front", "double"]
-    visible: bool
-
-
 def coarse(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], cells: int = CELLS) -> Mesh:
-    """A mesh with all vertices of one cell of a grid drawn together; triangles that vanish are left out.
+    """Draw together all vertices of one cell of a grid; triangles that vanish are left out.
 
     Args:
         vertices: of the mesh [m].
@@ -58,7 +49,7 @@ def coarse(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], ce
 
 
 def mesh_of(library: AssetLibrary, name: str, cells: int = CELLS) -> Mesh:
-    """The coarse mesh of an object.
+    """Load the coarse mesh of an object.
 
     What is recognised by its field needs no mesh on this machine, and what is on a table may have been removed since:
     such an object is a cube.
@@ -72,26 +63,68 @@ def mesh_of(library: AssetLibrary, name: str, cells: int = CELLS) -> Mesh:
         mesh = library.load_geometry(name)
     except OsfError as error:
         _log.info("%s is drawn as a cube: %s", name, error)
-        return box(_UNKNOWN_M)
+        return box(UNKNOWN_M)
     return coarse(mesh.vertices, mesh.faces, cells)
 
 
 def add_ghosts(
-    scene: viser.SceneApi, path: str, mesh: Mesh, poses: Pose, **style: Unpack[GhostStyle]
+    scene: viser.SceneApi,
+    path: str,
+    mesh: Mesh,
+    poses: Pose,
+    colour: Colour,
+    opacity: float,
+    *,
+    scale: float = 1.0,
+    shares: Float[np.ndarray, "N"] | None = None,
+    is_wire: bool = False,
+    visible: bool = True,
 ) -> viser.BatchedMeshHandle:
-    """A node with translucent copies of a mesh, which cast no shadows.
+    """Add a node with translucent copies of a mesh, which cast no shadows.
 
     Args:
         scene: to draw in.
         path: of the node.
         mesh: vertices [m] and faces.
         poses: of the copies, a batch (N,).
-        style: how the copies look.
+        colour: of the copies, taken for linear light.
+        opacity: of the copies.
+        scale: of the mesh; copies as large as the surfaces below them would flicker.
+        shares: of the opacity that each copy has; None is all of it.
+        is_wire: whether edges are drawn in place of faces.
+        visible: whether it can be seen from the beginning.
     """
     vertices, faces = mesh
-    turns, places = poses.quaternion.astype(np.float32), poses.position.astype(np.float32)
     return scene.add_batched_meshes_simple(
-        path, vertices, faces, turns, places, lod="off", cast_shadow=False, receive_shadow=False, **style
+        path,
+        vertices,
+        faces,
+        poses.quaternion.astype(np.float32),
+        poses.position.astype(np.float32),
+        batched_scales=np.full(len(poses.position), scale),
+        batched_colors=colour,
+        batched_opacities=shares,
+        opacity=opacity,
+        wireframe=is_wire,
+        side="double" if is_wire else "front",
+        lod="off",
+        cast_shadow=False,
+        receive_shadow=False,
+        visible=visible,
+    )
+
+
+def add_pusher_ghost(scene: viser.SceneApi, path: str) -> viser.CylinderHandle:
+    """Add a ghost of the pusher, hidden until it has somewhere to be."""
+    return scene.add_cylinder(
+        path,
+        radius=PUSHER_RADIUS_M * _PUSHER_SCALE,
+        height=PUSHER_HEIGHT_M,
+        color=PREDICTED,
+        opacity=_PUSHER_OPACITY,
+        cast_shadow=False,
+        receive_shadow=False,
+        visible=False,
     )
 
 
@@ -102,12 +135,12 @@ def move_ghosts(node: viser.BatchedMeshHandle, poses: Pose) -> None:
 
 
 def below_table(count: int) -> Pose:
-    """A batch of poses out of sight, for copies that have no place yet."""
-    return Pose(np.tile([0.0, 0.0, -1.0], (count, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
+    """Make a batch of poses out of sight, for copies that have no place yet."""
+    return Pose(np.tile([0.0, 0.0, -1.0], (count, 1)), np.tile(NO_TURN, (count, 1)))
 
 
 def box(side_m: float) -> Mesh:
-    """A cube around the origin."""
+    """Make a cube around the origin."""
     corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32) * side_m / 2
     faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6),
              (0, 6, 4), (1, 5, 7), (1, 7, 3)]  # fmt: skip
@@ -115,7 +148,7 @@ def box(side_m: float) -> Mesh:
 
 
 def sector(heading_rad: float, half_rad: float, inner_m: float, outer_m: float) -> Mesh:
-    """A flat piece of a ring around the origin, seen from above: headings from -half to +half about one.
+    """Make a flat piece of a ring around the origin, seen from above: headings from -half to +half about one.
 
     Args:
         heading_rad: of its middle, from +x toward +y.
@@ -133,33 +166,48 @@ def sector(heading_rad: float, half_rad: float, inner_m: float, outer_m: float) 
 
 
 def spread(poses: Pose, count: int) -> Pose:
-    """`count` of a batch of poses, evenly chosen; some more than once if there are fewer."""
+    """Choose `count` of a batch of poses evenly; some more than once if there are fewer."""
     rows = np.round(np.linspace(0, len(poses.position) - 1, count)).astype(int)
     return poses[rows]
 
 
 def moves(poses: Pose) -> bool:
-    """Whether an object on its way goes or turns far enough to be seen."""
+    """Check whether an object on its way goes or turns far enough to be seen."""
     shift = np.abs(poses.position - poses.position[0]).max()
     turn = 1 - np.abs(poses.quaternion @ poses.quaternion[0]).min()
-    return bool(shift > _MOVED_M or turn > _TURNED**2)
+    return bool(shift > MOVED_M or turn > _TURNED**2)
 
 
 def way_of(rollouts: Rollouts, number: int) -> Pose:
-    """The poses of an object in the first of some rollouts, one after each action."""
+    """Take the poses of an object in the first of some rollouts, one after each action."""
     return Pose(rollouts.positions[0, :, number], rollouts.quaternions[0, :, number])
 
 
 def between(rows: Float[np.ndarray, "T C"], step: float) -> Float[np.ndarray, "C"]:
-    """A row, or what lies between two; the first and the last one reach beyond the ends."""
+    """Interpolate between two rows; the first and the last one reach beyond the ends."""
     step = min(max(step, 0.0), len(rows) - 1.0)
     before = int(step)
     after = min(before + 1, len(rows) - 1)
     return rows[before] + (step - before) * (rows[after] - rows[before])
 
 
+def along_way(poses: Pose, count: int, arm_m: float = 0.0) -> list[int]:
+    """Choose rows that lie about evenly along a way, not in time: most futures begin with a gap.
+
+    Args:
+        poses: on the way, a batch (T,).
+        count: of rows; some may be equal.
+        arm_m: what turning by 1 rad counts on the way [m].
+    """
+    shifts = np.linalg.norm(np.diff(poses.position, axis=0), axis=1)
+    turns = rotation_angle(poses.quaternion[:-1], poses.quaternion[1:])
+    gone = np.cumsum(shifts + arm_m * turns)
+    rows = np.searchsorted(gone, gone[-1] * np.arange(1, count + 1) / (count + 1))
+    return [min(int(row) + 1, len(gone)) for row in rows]
+
+
 def pose_at(poses: Pose, step: float) -> Pose:
-    """Where something is on its way after some steps, which turn it by less than half a turn each."""
+    """Compute where something is on its way after some steps, which turn it by less than half a turn each."""
     signs = np.where(np.sum(poses.quaternion[1:] * poses.quaternion[:-1], axis=1) < 0, -1.0, 1.0)
     aligned = poses.quaternion * np.cumprod(np.concatenate([[1.0], signs]))[:, None]
     turn = between(aligned, step)
@@ -167,17 +215,17 @@ def pose_at(poses: Pose, step: float) -> Pose:
 
 
 def top_m(vertices: Float[np.ndarray, "P 3"], quaternion: Float[np.ndarray, "4"]) -> float:
-    """How far a turned mesh reaches above its origin [m]."""
+    """Compute how far a turned mesh reaches above its origin [m]."""
     return float(rotate(quaternion, vertices)[:, 2].max())
 
 
 def footprint_m(vertices: Float[np.ndarray, "P 3"], quaternion: Float[np.ndarray, "4"]) -> float:
-    """How far a turned mesh reaches sideways from its origin [m]."""
+    """Compute how far a turned mesh reaches sideways from its origin [m]."""
     return float(np.linalg.norm(rotate(quaternion, vertices)[:, :2], axis=1).max())
 
 
 def heading_rad(quaternion: Float[np.ndarray, "4"]) -> float:
-    """Where that axis of an object points, seen from above, that lies flattest; from +x toward +y."""
+    """Compute where that axis of an object points, seen from above, that lies flattest; from +x toward +y."""
     axes = rotate(quaternion, np.eye(3))
     x, y, _ = axes[int(np.abs(axes[:, 2]).argmin())]
     return float(np.arctan2(y, x))

@@ -1,39 +1,51 @@
-"""The nodes that show a prediction: ghosts that move with time, a trail of paler ones, and the ways things go."""
+"""The nodes of pushes: handles for the way of the pusher, and a prediction with the ways that things go."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.nodes.atomic import atomic
-from app.viewer.nodes.ghosts import Mesh, add_ghosts, between, mesh_of, move_ghosts, moves, pose_at, top_m, way_of
+from app.viewer.nodes.ghosts import (
+    FINE_CELLS,
+    MOVED_M,
+    PREDICTED,
+    TRUE,
+    Mesh,
+    add_ghosts,
+    add_pusher_ghost,
+    along_way,
+    between,
+    mesh_of,
+    move_ghosts,
+    moves,
+    pose_at,
+    top_m,
+    way_of,
+)
+from app.viewer.nodes.room import NO_LINES, atomic
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
+from osfcore.geometry.workspace import PUSHER_REACH_M
 from osfcore.objects.asset_library import AssetLibrary
 
-PREDICTED, TRUE = (190, 50, 210), (25, 25, 25)  # neither is a colour of estimates
 TRAIL = 5  # pale ghosts between start and end
-_CELLS = 28
-_GHOST_OPACITY, _TRAIL_OPACITY, _PUSHER_OPACITY = 0.5, 0.13, 0.35
+_GHOST_OPACITY, _TRAIL_OPACITY = 0.5, 0.13
 _GHOST_SCALE, _TRAIL_SCALE = 1.01, 1.005  # or ghosts and the surface below them would flicker
 _ABOVE_M = 0.012  # ways of objects are drawn above them, that of the pusher above the table
 _FLOOR_M = 0.004
 _LINE_M = 0.004
-_MOVED_M = 5e-4
-_NOWHERE = np.zeros((1, 2, 3), np.float32)
 
 
 class PushNodes:
-    """Nodes below /push. Any thread may call.
+    """A prediction: ghosts that move with time, a trail of paler ones, and the ways things go. Any thread may call.
 
     Args:
-        server: to draw in.
+        server: to draw in, below /push.
         library: meshes of the objects.
     """
 
@@ -42,17 +54,16 @@ class PushNodes:
         self._scene = server.scene
         self._library = library
         self._lock = threading.RLock()
-        self._meshes: dict[str, Mesh] = {}
+        self._meshes: dict[str, Mesh] = {}  # of what is on view; objects may be removed, and come back
         self._rollouts: Rollouts | None = None
         self._step = 0.0
         self._ghosts: dict[str, viser.BatchedMeshHandle] = {}
         self._trails: list[viser.SceneNodeHandle] = []
-        self._heights_m: dict[str, float] = {}
         add = self._scene.add_line_segments
-        self._plan = add("/push/plan", _NOWHERE, PREDICTED, thickness=0.006, visible=False)
-        self._ways = add("/push/ways", _NOWHERE, PREDICTED, thickness=_LINE_M, visible=False)
-        self._true_ways = add("/push/true_ways", _NOWHERE, TRUE, thickness=_LINE_M, visible=False)
-        self._pusher = pusher_ghost(self._scene, "/push/pusher")
+        self._plan = add("/push/plan", NO_LINES, PREDICTED, thickness=0.006, visible=False)
+        self._ways = add("/push/ways", NO_LINES, PREDICTED, thickness=_LINE_M, visible=False)
+        self._true_ways = add("/push/true_ways", NO_LINES, TRUE, thickness=_LINE_M, visible=False)
+        self._pusher = add_pusher_ghost(self._scene, "/push/pusher")
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -108,23 +119,20 @@ class PushNodes:
     def _remove(self) -> None:
         for node in (*self._ghosts.values(), *self._trails):
             node.remove()
-        self._rollouts, self._ghosts, self._trails, self._heights_m = None, {}, [], {}
+        self._rollouts, self._ghosts, self._trails, self._meshes = None, {}, [], {}
         self._true_ways.visible = False
 
     def _add_object(self, name: str, poses: Pose) -> np.ndarray:
-        """Ghost and trail of an object; returns the line of its way (T, 3) [m]."""
-        mesh = self._mesh(name)
-        rows = _spaced(poses, TRAIL)
-        if len(rows):
-            self._trails.append(self._copies(f"/push/trail/{name}", mesh, poses[rows], _TRAIL_OPACITY, _TRAIL_SCALE))
-        self._ghosts[name] = self._copies(f"/push/ghost/{name}", mesh, poses[-1:], _GHOST_OPACITY, _GHOST_SCALE)
+        """Add ghost and trail of an object; returns the line of its way (T, 3) [m]."""
+        scene, mesh = self._scene, self._mesh(name)
+        gone_m = float(np.linalg.norm(np.diff(poses.position, axis=0), axis=1).sum())
+        rows = sorted({row for row in along_way(poses, TRAIL) if row < len(poses.position) - 1})
+        if gone_m > MOVED_M and rows:
+            path, pale = f"/push/trail/{name}", poses[rows]
+            self._trails.append(add_ghosts(scene, path, mesh, pale, PREDICTED, _TRAIL_OPACITY, scale=_TRAIL_SCALE))
+        path = f"/push/ghost/{name}"
+        self._ghosts[name] = add_ghosts(scene, path, mesh, poses[-1:], PREDICTED, _GHOST_OPACITY, scale=_GHOST_SCALE)
         return self._way(name, poses)
-
-    def _copies(self, path: str, mesh: Mesh, poses: Pose, opacity: float, scale: float) -> viser.BatchedMeshHandle:
-        scales = np.full(len(poses.position), scale)
-        return add_ghosts(
-            self._scene, path, mesh, poses, batched_scales=scales, batched_colors=PREDICTED, opacity=opacity
-        )
 
     def _at(self, step: float) -> None:
         if self._rollouts is None:
@@ -136,38 +144,14 @@ class PushNodes:
         self._pusher.position = between(self._rollouts.pusher[0], step)
 
     def _way(self, name: str, poses: Pose) -> np.ndarray:
-        """The way of an object's centre, as high as the object was at the start, so that it stays in view."""
-        if name not in self._heights_m:
-            self._heights_m[name] = top_m(self._mesh(name)[0], poses.quaternion[0]) + _ABOVE_M
-        return poses.position + np.array([0.0, 0.0, self._heights_m[name]])
+        """Compute the way of an object's centre, as high as the object was at the start, so that it stays in view."""
+        height_m = top_m(self._mesh(name)[0], poses.quaternion[0]) + _ABOVE_M
+        return poses.position + np.array([0.0, 0.0, height_m])
 
     def _mesh(self, name: str) -> Mesh:
-        if not self._library.has(name):  # removed since the scene was made, and may come back
-            return mesh_of(self._library, name)
         if name not in self._meshes:
-            self._meshes[name] = mesh_of(self._library, name, _CELLS)
+            self._meshes[name] = mesh_of(self._library, name, FINE_CELLS)
         return self._meshes[name]
-
-
-def pusher_ghost(scene: viser.SceneApi, path: str) -> viser.CylinderHandle:
-    """A ghost of the pusher, hidden until it has somewhere to be."""
-    return scene.add_cylinder(
-        path,
-        radius=PUSHER_RADIUS_M * _GHOST_SCALE,
-        height=PUSHER_HEIGHT_M,
-        color=PREDICTED,
-        opacity=_PUSHER_OPACITY,
-        cast_shadow=False,
-        receive_shadow=False,
-        visible=False,
-    )
-
-
-def _spaced(poses: Pose, count: int) -> np.ndarray:
-    """Rows between start and end that lie about evenly along the way, not in time: most pushes begin with a gap."""
-    gone = np.cumsum(np.linalg.norm(np.diff(poses.position, axis=0), axis=1))
-    rows = 1 + np.searchsorted(gone, gone[-1] * np.arange(1, count + 1) / (count + 1))
-    return np.unique(rows[(rows < len(gone)) & (gone[-1] > _MOVED_M)])
 
 
 def _draw(node: viser.LineSegmentsHandle, lines: Sequence[np.ndarray]) -> None:
@@ -179,3 +163,54 @@ def _draw(node: viser.LineSegmentsHandle, lines: Sequence[np.ndarray]) -> None:
             node.points = points
     if node.visible != bool(parts):
         node.visible = bool(parts)
+
+
+# Waypoints
+
+FEWEST, MOST = 2, 5
+SPACING_M = 0.07
+_HANDLE_Z_M = 0.01
+
+
+class Waypoints:
+    """Up to five handles, made once and shown on demand.
+
+    Args:
+        server: to draw in.
+        on_drag: called on viser's loop when one was moved by hand; must be quick.
+    """
+
+    def __init__(self, server: viser.ViserServer, on_drag: Callable[[], None]) -> None:
+        self._handles = [self._add_handle(server.scene, number, on_drag) for number in range(MOST)]
+
+    @staticmethod
+    def _add_handle(scene: viser.SceneApi, number: int, on_drag: Callable[[], None]) -> viser.TransformControlsHandle:
+        path = f"/push/waypoints/{number}"
+        handle = scene.add_transform_controls(
+            path, scale=0.07, active_axes=(True, True, False), disable_rotations=True, depth_test=False, visible=False
+        )
+        scene.add_icosphere(f"{path}/ball", 0.008, PREDICTED, cast_shadow=False, receive_shadow=False)
+        scene.add_label(f"{path}/number", str(number + 1), font_screen_scale=0.8, anchor="bottom-center")
+
+        async def drag(_: viser.TransformControlsEvent) -> None:
+            on_drag()
+
+        handle.on_update(drag)
+        return handle
+
+    def show(self, count: int) -> None:
+        """Show the first few handles; 0 hides all."""
+        for number, handle in enumerate(self._handles):
+            if handle.visible != (number < count):
+                handle.visible = number < count
+
+    def lay(self, start: Float[np.ndarray, "2"], heading_rad: float) -> None:
+        """Put them in a row that begins at the pusher [m], within its reach."""
+        step = SPACING_M * np.array([np.cos(heading_rad), np.sin(heading_rad)])
+        for number, handle in enumerate(self._handles, 1):
+            x, y = np.clip(start + number * step, -PUSHER_REACH_M, PUSHER_REACH_M)
+            handle.position = (float(x), float(y), _HANDLE_Z_M)
+
+    def places(self, count: int) -> Float[np.ndarray, "P 2"]:
+        """Where the first few are [m]."""
+        return np.array([handle.position[:2] for handle in self._handles[:count]], float)

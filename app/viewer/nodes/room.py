@@ -1,10 +1,16 @@
-"""What is around every scene in the 3D view: the table, its axes, the ambient light, and where one looks from."""
+"""What is around every scene in the 3D view, and what all drawings share: changes at once, labels, marks of lights."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import viser
+from jaxtyping import Float
 
+from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.world.imaging import TABLE_ALBEDO
@@ -13,6 +19,11 @@ from osfcore.world.imaging import TABLE_ALBEDO
 VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.0, -1.31, 0.97), (0.0, 0.02, 0.0), 0.7
 TABLE_THICKNESS_M = 0.04
 AXES_M = 0.12  # arrows on the table's corner, so that "push toward +x" means something
+NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+NO_LINES = np.zeros((1, 2, 3), np.float32)  # viser has no node of no lines
+_STILL = 1e-6  # poses that differ by less are not sent again
+Colour = tuple[int, int, int]
+Target = viser.ViserServer | viser.ClientHandle  # what draws for all browsers, or for one
 
 
 def add_room(server: viser.ViserServer) -> None:
@@ -40,7 +51,124 @@ def add_room(server: viser.ViserServer) -> None:
         scene.add_label(f"/axes/{name}", name, position=offset, font_screen_scale=0.8)
 
 
-def colour_of(albedo: tuple[float, float, float]) -> tuple[int, int, int]:
-    """An albedo as viser takes colours."""
+def colour_of(albedo: tuple[float, float, float]) -> Colour:
+    """Convert an albedo to a colour as viser takes it."""
     red, green, blue = (round(255 * channel) for channel in albedo)
     return red, green, blue
+
+
+# Changes
+
+
+@contextlib.contextmanager
+def atomic(server: Target) -> Iterator[None]:
+    """Send what changes inside as one message, at once."""
+    with server.atomic():
+        yield
+    server.flush()
+
+
+def put(node: viser.SceneNodeHandle, position: np.ndarray, quaternion: np.ndarray | None = None) -> None:
+    """Move a node [m], and turn it, if it is elsewhere or nowhere (NaN)."""
+    if not np.abs(np.asarray(node.position) - position).max() <= _STILL:
+        node.position = np.asarray(position, float)
+    if quaternion is not None and not np.abs(np.asarray(node.wxyz) - quaternion).max() <= _STILL:
+        node.wxyz = np.asarray(quaternion, float)
+
+
+# Labels
+
+CHARACTER, LINE = 0.011, 0.032  # width of a character and height of a label, as shares of the view's height
+_RISE_M = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Label:
+    """A label in the 3D view.
+
+    Attributes:
+        text: what it says.
+        anchor_m: the middle of its foot, in the world [m].
+    """
+
+    text: str
+    anchor_m: Float[np.ndarray, "3"]
+
+
+def separated(
+    anchors_m: Float[np.ndarray, "N 3"], texts: Sequence[str], standing: Sequence[Label] = ()
+) -> Float[np.ndarray, "N 3"]:
+    """Raise the anchors of labels where one would cover another, as the view is at first.
+
+    A label stands on its anchor. From the lowest in the view to the highest, each is raised until it is clear of those
+    before it.
+
+    Args:
+        anchors_m: where each would stand best, in the world [m].
+        texts: of the labels.
+        standing: labels that are on view already, and stay.
+    """
+    view = Camera.look_at("view", VIEW_FROM, VIEW_AT, fov_y_deg=float(np.rad2deg(VIEW_FOV_RAD)))
+    place = view.project(anchors_m) / view.height
+    higher = view.project(anchors_m + np.array([0, 0, _RISE_M])) / view.height
+    raised = anchors_m.copy()
+    taken: list[tuple[float, float, float]] = []  # middle, half width and foot of labels that have their place
+    for label in standing:
+        middle, foot = view.project(label.anchor_m[None])[0] / view.height
+        taken.append((middle, CHARACTER * len(label.text) / 2, foot))
+    for n in np.argsort(-place[:, 1], kind="stable"):
+        (middle, foot), half = place[n], CHARACTER * len(texts[n]) / 2
+        for other_middle, other_half, other_foot in sorted(taken, key=lambda label: -label[2]):
+            if abs(middle - other_middle) < half + other_half and abs(foot - other_foot) < LINE:
+                foot = other_foot - LINE
+        raised[n, 2] += _RISE_M * (place[n, 1] - foot) / (place[n, 1] - higher[n, 1])
+        taken.append((middle, half, foot))
+    return raised
+
+
+# Lights
+
+LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
+AT = 0.66  # where the dot stands on the way from the table's centre to the light
+_RAY = (0.46, AT)  # where the line begins and ends
+_DOT_PX, _RAY_PX = 15.0, 2.5
+_DOT = np.array([[[0, 0, 0], [0, 0, 1e-4]]], np.float32)  # a line this short is its own two round ends
+
+
+class LightMarker:
+    """Where a light is: a dot of one size on the screen, a stretch of the line along which it falls, and words.
+
+    Only a light's direction can be observed, so the dot stands nearer than the light does: at the height of the
+    cameras, where it is in view and seldom before an object.
+
+    Args:
+        scene: to draw in.
+        path: of the dot; the others are beside it, with `_ray` and `_name` at the end.
+        is_below: whether the words stand below the dot.
+    """
+
+    def __init__(self, scene: viser.SceneApi, path: str, *, is_below: bool = False) -> None:
+        add = scene.add_line_segments
+        self._dot = add(path, _DOT, LIGHT_COLOUR, thickness=_DOT_PX, thickness_units="screen")
+        self._ray = add(f"{path}_ray", _DOT, LIGHT_COLOUR, thickness=_RAY_PX, thickness_units="screen")
+        anchor = "top-center" if is_below else "bottom-center"
+        self._name = scene.add_label(f"{path}_name", "", visible=False, font_screen_scale=0.8, anchor=anchor)
+
+    def place(self, position: Float[np.ndarray, "3"]) -> None:
+        """Mark a light at a position 1 m from the table's centre."""
+        at = np.asarray(position, float)
+        if np.abs(np.asarray(self._dot.position) - AT * at).max() > _STILL:
+            self._dot.position = self._name.position = AT * at
+            self._ray.points = np.stack([_RAY[0] * at, _RAY[1] * at])[None].astype(np.float32)
+
+    def show(self, *, is_on: bool = True, has_ray: bool = True, text: str = "", colour: Colour = LIGHT_COLOUR) -> None:
+        """Show or hide it; without a text it has no words."""
+        self._dot.visible, self._ray.visible = is_on, is_on and has_ray
+        self._name.text, self._name.visible = text, is_on and bool(text)
+        if tuple(self._dot.colors) != colour:
+            self._dot.colors = self._ray.colors = np.array(colour, np.uint8)
+
+    def remove(self) -> None:
+        """Remove it."""
+        for node in (self._dot, self._ray, self._name):
+            node.remove()

@@ -1,28 +1,38 @@
-"""The nodes that show a scene in the 3D view."""
+"""The nodes that show a scene in the 3D view, and its shadows."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
+import cv2
 import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.processes.messages.scene_messages import SceneRecord
-from app.viewer.nodes.atomic import Target, atomic, put
-from app.viewer.nodes.label_layout import Label, separated
-from app.viewer.nodes.light_marker import AT, LightMarker
-from app.viewer.nodes.room import colour_of
-from app.viewer.nodes.shadow_nodes import ShadowNodes
+from app.viewer.nodes.ghosts import UNKNOWN_M, Mesh, box
+from app.viewer.nodes.room import (
+    AT,
+    LIGHT_COLOUR,
+    NAMED_LIGHT_COLOUR,
+    NO_TURN,
+    Label,
+    LightMarker,
+    Target,
+    atomic,
+    colour_of,
+    put,
+    separated,
+)
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.light import DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
-from osfcore.geometry.poses import Pose, quaternion_multiply, quaternion_to_matrix
+from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
+from osfcore.geometry.poses import Pose, quaternion_multiply, quaternion_to_matrix, rotate
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
+from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.imaging import TABLE_ALBEDO
 
 # Everything that is drawn of the live table, here and elsewhere; the room around it is not.
 LIVE_NODES = (
@@ -32,10 +42,8 @@ LIVE_NODES = (
 # A browser's own lamp takes the place of the one for all, wherever its other nodes are: the table is dark while a lamp
 # that was hidden is put up again.
 LAMP = "/lamp"
-LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
 LABEL_GAP_M = 0.01
 _NUDGE = 1e-7  # viser sends nothing that is as it was
-NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
 
@@ -67,8 +75,7 @@ class SceneNodes:
         self._scene = server.scene
         self._library = library
         self._on_move = on_move
-        self._on_light = on_light
-        self._on_change: Callable[[], None] = _nothing
+        self._on_change: Callable[[], object] = tuple
         self._lock = threading.RLock()
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
         self._labels: dict[str, viser.LabelHandle] = {}
@@ -80,17 +87,24 @@ class SceneNodes:
         self._has_names = True
         self._has_gizmos = False
         self._light_requests: dict[str, tuple[bool, str]] = {}
-        self._lamp_look = True, ""
+        self._lamp_look = True, ""  # whether it is visible, and the text beside it
         self._shadows = ShadowNodes(self._scene, library, f"{root}/shadows")
-        self._add_pusher()
-        self._add_light()
+        self._pusher = self._scene.add_cylinder(
+            f"{root}/pusher",
+            radius=PUSHER_RADIUS_M,
+            height=PUSHER_HEIGHT_M,
+            color=colour_of(PUSHER_ALBEDO),
+            visible=False,
+        )
+        start = (0.0, 0.0, 1.0)
+        # three.js divides by pi what Lambert's law does not
+        self._lamp = self._scene.add_light_directional(LAMP, intensity=float(np.pi * DIFFUSE), position=start)
+        self._marker = LightMarker(self._scene, f"{root}/light")
+        self._place_light(np.array(start))
+        self._light_gizmo = None if on_light is None else self._add_light_handle(on_light, start)
         self._frustums = {camera.name: self._frustum(camera) for camera in cameras}
 
-    def show(self, record: SceneRecord | None) -> None:
-        """Begin with a scene, or clear the table."""
-        self.begin(None if record is None else record.state)
-
-    def begin(self, state: SceneState | None) -> None:
+    def show(self, state: SceneState | None) -> None:
         """Begin with a state of any objects, or clear the table."""
         names = () if state is None else state.names
         with self._lock, atomic(self._server):  # what was on the table before is never seen on the new one
@@ -130,7 +144,10 @@ class SceneNodes:
         with self._lock, atomic(self._server):
             for name in state.names:
                 if name in self._bodies and name not in self._grabbed:
-                    self._place_object(name, state.pose(name))
+                    pose = state.pose(name)
+                    put(self._bodies[name], pose.position, pose.quaternion)
+                    if name in self._gizmos:
+                        put(self._gizmos[name], pose.position, NO_TURN)
             self._place_labels()
             if state.pusher is not None:
                 put(self._pusher, state.pusher)
@@ -201,25 +218,6 @@ class SceneNodes:
                     handle.position = np.asarray(handle.position, float) + _NUDGE
                     handle.wxyz = np.asarray(handle.wxyz, float) * (1 + _NUDGE)
 
-    def _add_pusher(self) -> None:
-        self._pusher = self._scene.add_cylinder(
-            f"{self._root}/pusher",
-            radius=PUSHER_RADIUS_M,
-            height=PUSHER_HEIGHT_M,
-            color=colour_of(PUSHER_ALBEDO),
-            visible=False,
-        )
-
-    def _add_light(self) -> None:
-        scene = self._scene
-        start = (0.0, 0.0, 1.0)
-        root = self._root
-        # three.js divides by pi what Lambert's law does not
-        self._lamp = scene.add_light_directional(LAMP, intensity=float(np.pi * DIFFUSE), position=start)
-        self._marker = LightMarker(scene, f"{root}/light", LIGHT_COLOUR)
-        self._place_light(np.array(start))
-        self._light_gizmo = None if self._on_light is None else self._add_light_handle(self._on_light, start)
-
     def _add_light_handle(
         self, on_light: Callable[[Light, Client], None], start: tuple[float, float, float]
     ) -> viser.TransformControlsHandle:
@@ -268,10 +266,8 @@ class SceneNodes:
             label = self._library.info(name).label
         except OsfError as error:  # removed or damaged since the scene was made: its name still shows where it is
             _log.warning("%s is not drawn: %s", name, error)
-            body, label = (
-                self._scene.add_frame(f"{self._root}/objects/{name}", axes_length=0.05, axes_radius=0.002),
-                name,
-            )
+            body = self._scene.add_frame(f"{self._root}/objects/{name}", axes_length=0.05, axes_radius=0.002)
+            label = name
         self._bodies[name] = body
         self._labels[name] = self._scene.add_label(
             f"{self._root}/names/{name}", label, visible=self._has_names, font_screen_scale=0.8, anchor="bottom-center"
@@ -291,7 +287,7 @@ class SceneNodes:
                 # Handles stay along the axes of the table: what they turn is added to how the object lay before.
                 turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
                 pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
-                self._follow(name, pose)
+                put(body, pose.position, pose.quaternion)
                 self._place_labels()
                 self._draw_shadows()
             self._on_change()
@@ -302,29 +298,18 @@ class SceneNodes:
         gizmo.on_update(drag)
         return gizmo
 
-    def _follow(self, name: str, pose: Pose) -> None:
-        body = self._bodies.get(name)
-        if body is not None:
-            put(body, pose.position, pose.quaternion)
-
     def _place_labels(self) -> None:
-        anchors = [self._anchor(name) for name in self._labels]
-        if not anchors:
+        """Put the names above the tops of their objects, clear of each other."""
+        if not self._labels:
             return
+        anchors = []
+        for name in self._labels:
+            body, size_m = self._bodies[name], self._sizes_m.get(name, np.zeros(3))
+            top_m = float(np.abs(quaternion_to_matrix(np.asarray(body.wxyz))[2]) @ size_m / 2)
+            anchors.append(np.asarray(body.position, float) + np.array([0.0, 0.0, top_m + LABEL_GAP_M]))
         texts = [label.text for label in self._labels.values()]
         for label, anchor in zip(self._labels.values(), separated(np.array(anchors), texts), strict=True):
             put(label, anchor)
-
-    def _anchor(self, name: str) -> Float[np.ndarray, "3"]:
-        """Above the top of an object [m]."""
-        body, size_m = self._bodies[name], self._sizes_m.get(name, np.zeros(3))
-        top_m = float(np.abs(quaternion_to_matrix(np.asarray(body.wxyz))[2]) @ size_m / 2)
-        return np.asarray(body.position, float) + np.array([0.0, 0.0, top_m + LABEL_GAP_M])
-
-    def _place_object(self, name: str, pose: Pose) -> None:
-        self._follow(name, pose)
-        if name in self._gizmos:
-            put(self._gizmos[name], pose.position, NO_TURN)
 
     def _draw_shadows(self) -> None:
         if self._bodies:
@@ -340,10 +325,6 @@ class SceneNodes:
         self._marker.show(is_on=is_on, has_ray=self._pusher.visible, text=name, colour=colour)
 
 
-def _nothing() -> None:
-    """The callback until `watch` is called."""
-
-
 def light_toward(position: np.ndarray) -> Light | None:
     """The light in the direction of a point [m], kept above the lowest elevation; None for the table's centre."""
     if not np.all(np.isfinite(position)) or not np.linalg.norm(position) > 1e-6:
@@ -351,3 +332,126 @@ def light_toward(position: np.ndarray) -> Light | None:
     x, y, z = position / np.linalg.norm(position)
     lowest_rad = float(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))
     return Light.from_angles(float(np.arctan2(y, x)), max(float(np.arcsin(np.clip(z, -1, 1))), lowest_rad))
+
+
+# Shadows
+
+_ABOVE_M = 0.0007  # the table, so that it does not flicker
+_CORNERS = 20  # of the pusher's rim
+_GAMMA = 2.2  # of viser's colours
+_NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
+Polygon = Float[np.ndarray, "K 2"]
+
+
+class ShadowNodes:
+    """One flat node with the hard shadows of all objects and the pusher on the table.
+
+    viser's own shadows are blurred over eight centimetres at the scale of a tabletop. A parallel light maps every
+    convex part of an object onto the plane z = 0 along its direction, x - z l_xy / l_z; the shadow of the part is the
+    convex hull of its mapped vertices, clipped to the table. Shadows that fall on other objects are left to the
+    rendered pictures. See `osfcore.world.imaging` for the images that the cameras take.
+
+    Args:
+        scene: to draw in.
+        library: convex parts of the objects.
+        path: of the node.
+    """
+
+    def __init__(self, scene: viser.SceneApi, library: AssetLibrary, path: str) -> None:
+        self._library = library
+        self._parts: dict[str, list[np.ndarray]] = {}
+        self._is_on = False
+        self._node = scene.add_mesh_simple(
+            path, *_NOTHING, side="double", visible=False, cast_shadow=False, receive_shadow=False
+        )
+
+    def show(self, state: SceneState | None) -> None:
+        """Draw the shadows of a state, or none."""
+        if self._is_on != (state is not None):  # else it may be hidden, and stay so
+            self._node.visible = self._is_on = state is not None
+        if state is None:
+            return
+        vertices, faces = shadow_mesh(self._hulls(state), state.light.position)
+        if not np.array_equal(vertices, self._node.vertices):
+            self._node.vertices, self._node.faces = vertices, faces
+        colour = shadow_colour(float(state.light.position[2]))
+        if tuple(self._node.color) != colour:
+            self._node.color = colour
+
+    def _hulls(self, state: SceneState) -> Iterable[Float[np.ndarray, "P 3"]]:
+        """Yield world vertices of every convex part [m]."""
+        for name in state.names:
+            pose = state.pose(name)
+            for part in self._parts_of(name):
+                yield rotate(pose.quaternion, part) + pose.position
+        if state.pusher is not None:
+            yield state.pusher + _cylinder()
+
+    def _parts_of(self, name: str) -> list[np.ndarray]:
+        if name not in self._parts:
+            try:
+                self._parts[name] = [part.astype(float) for part in self._library.load_geometry(name).parts]
+            except OsfError as error:
+                _log.info("%s casts the shadow of a cube: %s", name, error)
+                return [box(UNKNOWN_M)[0].astype(float)]
+        return self._parts[name]
+
+
+def shadow_mesh(bodies: Iterable[Float[np.ndarray, "P 3"]], light: Float[np.ndarray, "3"]) -> Mesh:
+    """Flat triangles that cover the shadows of convex bodies on the table.
+
+    Args:
+        bodies: vertices of each [m, world].
+        light: direction toward it.
+    """
+    slope = light[:2] / light[2]
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
+    for body in bodies:
+        above = body[:, 2].clip(0)[:, None]
+        hull = cv2.convexHull((body[:, :2] - above * slope).astype(np.float32))[:, 0].astype(float)
+        polygon = clipped(hull, TABLE_SIDE_M / 2)
+        if len(polygon) < 3:
+            continue
+        vertices.append(np.column_stack([polygon, np.full(len(polygon), _ABOVE_M)]))
+        fan = np.arange(1, len(polygon) - 1)
+        faces.append(count + np.column_stack([np.zeros_like(fan), fan, fan + 1]))
+        count += len(polygon)
+    if not count:
+        return _NOTHING
+    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
+
+
+def clipped(polygon: Polygon, half_m: float) -> Polygon:
+    """The part of a convex polygon within a square around the origin (Sutherland and Hodgman 1974)."""
+    for axis in (0, 1):
+        for sign in (1.0, -1.0):
+            inside = half_m - sign * polygon[:, axis]
+            after, polygon_after = np.roll(inside, -1), np.roll(polygon, -1, axis=0)
+            kept = []
+            for k in range(len(polygon)):
+                if inside[k] >= 0:
+                    kept.append(polygon[k])
+                if (inside[k] >= 0) != (after[k] >= 0):
+                    share = inside[k] / (inside[k] - after[k])
+                    kept.append(polygon[k] + share * (polygon_after[k] - polygon[k]))
+            polygon = np.array(kept).reshape(-1, 2)
+    return polygon
+
+
+def shadow_colour(cosine: float) -> tuple[int, int, int]:
+    """The table's colour with the lamp's share taken out, since the node itself is lit like the table.
+
+    Args:
+        cosine: of the angle between light and vertical.
+    """
+    share = AMBIENT / (AMBIENT + DIFFUSE * cosine)
+    red, green, blue = (round(255 * albedo * share ** (1 / _GAMMA)) for albedo in TABLE_ALBEDO)
+    return red, green, blue
+
+
+def _cylinder() -> Float[np.ndarray, "P 3"]:
+    """Vertices around the pusher's centre [m]."""
+    angles = np.linspace(0, 2 * np.pi, _CORNERS, endpoint=False)
+    rim = PUSHER_RADIUS_M * np.column_stack([np.cos(angles), np.sin(angles)])
+    ends = [np.column_stack([rim, np.full(_CORNERS, z)]) for z in (-PUSHER_HEIGHT_M / 2, PUSHER_HEIGHT_M / 2)]
+    return np.concatenate(ends)

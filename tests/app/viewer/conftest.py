@@ -10,7 +10,7 @@ import pytest
 import viser
 from viser._gui_handles import GuiProgressBarHandle
 
-from app.viewer.nodes.light_marker import AT
+from app.viewer.nodes.room import AT
 from app.viewer.private_server import PrivateViser
 from tests.app.conftest import until
 

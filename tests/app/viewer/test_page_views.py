@@ -1,6 +1,8 @@
 """Views of single pages, with browsers that speak viser's protocol through the relay."""
 
+import threading
 import time
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -8,9 +10,10 @@ import pytest
 import viser
 from websockets.sync.client import connect
 
-from app.episodes.replay_clock import ReplayClock
-from app.episodes.trajectory import read_trajectory
+from app.episodes.trajectory import ReplayClock, read_trajectory
 from app.services.examples.stories import Stories
+from app.viewer.page_views import PageViews, Replay, Wish
+from app.viewer.private_server import SECRET_HEADER
 from tests.app.conftest import until
 from tests.app.viewer.conftest import uuid_of
 
@@ -29,11 +32,15 @@ def course():
 class Page:
     """A page whose view is open."""
 
-    def __init__(self, live, name):
-        self._clients, before = live.services.viewer.server.get_clients, set(live.services.viewer.server.get_clients())
-        self._address, self._socket = f"ws://127.0.0.1:{live.port}/viewer/{name}", None
+    def __init__(self, server, address, headers=()):
+        self._clients, before = server.get_clients, set(server.get_clients())
         self._socket = connect(
-            self._address, subprotocols=[f"viser-v{viser.__version__}"], compression=None, max_size=None, proxy=None
+            address,
+            subprotocols=[f"viser-v{viser.__version__}"],
+            additional_headers=dict(headers),
+            compression=None,
+            max_size=None,
+            proxy=None,
         )
         self._socket.send(msgspec.msgpack.encode(CAMERA))
         until(lambda: set(self._clients()) - before)
@@ -50,16 +57,25 @@ class Page:
         self._socket.send(frame)
 
     @property
+    def client(self):
+        return self._clients()[self._number]
+
+    @property
     def camera(self):
-        return self._clients()[self._number].camera
+        return self.client.camera
 
     def own(self, path):
         """A node that this browser alone sees; None if there is none."""
-        return self._clients()[self._number].scene.get_handle_by_name(path)
+        return self.client.scene.get_handle_by_name(path)
 
     def hides(self, path):
         node = self.own(path)
         return node is not None and not node.visible
+
+
+def opened(live, name):
+    """A page of a running service."""
+    return Page(live.services.viewer.server, f"ws://127.0.0.1:{live.port}/viewer/{name}")
 
 
 def ask(live, page, replay=None, **more):
@@ -69,7 +85,7 @@ def ask(live, page, replay=None, **more):
 
 
 def test_a_page_sees_an_episode_in_place_of_the_live_table_and_other_pages_do_not(live, shown, course):
-    with Page(live, "one") as one, Page(live, "two") as two:
+    with opened(live, "one") as one, opened(live, "two") as two:
         assert ask(live, "one", {"story": STORY, "at_s": 0.0})
         until(lambda: one.own(f"/replay/objects/{course.names[0]}"))
         assert one.hides("/objects")
@@ -83,7 +99,7 @@ def test_a_page_sees_an_episode_in_place_of_the_live_table_and_other_pages_do_no
 @pytest.mark.parametrize("step", [0, 3, -1])
 def test_everything_is_where_it_was_after_a_step(live, course, step):
     at_s, action = ReplayClock(course).step_s[step], course.rounds[step].action
-    with Page(live, "page") as page:
+    with opened(live, "page") as page:
         ask(live, "page", {"story": STORY, "at_s": at_s})
         body = until(lambda: page.own(f"/replay/objects/{course.names[0]}"))
         until(lambda: np.allclose(body.position, course.states[action].poses.position[0], atol=1e-5))
@@ -94,7 +110,7 @@ def test_everything_is_where_it_was_after_a_step(live, course, step):
 
 def test_it_plays_to_the_end_by_itself_faster_if_wanted(live, course):
     end_s = ReplayClock(course).length_s
-    with Page(live, "page") as page:
+    with opened(live, "page") as page:
         ask(live, "page", {"story": STORY, "at_s": end_s - 4.0, "plays": True, "speed": 16.0})
         pusher = until(lambda: page.own("/replay/pusher"))
         until(lambda: np.allclose(pusher.position, course.states[-1].pusher, atol=1e-5))
@@ -103,7 +119,7 @@ def test_it_plays_to_the_end_by_itself_faster_if_wanted(live, course):
 
 def test_a_replay_shows_beliefs_alone_and_goes_on_with_meshes(live, course):
     replay, name = {"story": STORY, "at_s": ReplayClock(course).step_s[0]}, f"/replay/objects/{course.names[0]}"
-    with Page(live, "page") as page:
+    with opened(live, "page") as page:
         ask(live, "page", replay)
         body = until(lambda: page.own(name))
         ask(live, "page", replay, shows="beliefs")
@@ -121,7 +137,7 @@ def test_a_replay_shows_beliefs_alone_and_goes_on_with_meshes(live, course):
 def test_what_plays_goes_on_when_something_else_of_it_is_looked_at(live, course):
     end_s = ReplayClock(course).length_s
     replay = {"story": STORY, "at_s": end_s - 8.0, "plays": True, "speed": 4.0}
-    with Page(live, "page") as page:
+    with opened(live, "page") as page:
         ask(live, "page", replay)
         pusher = until(lambda: page.own("/replay/pusher"))
         deadline = time.monotonic() + 120.0
@@ -139,7 +155,7 @@ def test_a_page_that_only_watches_moves_its_camera_and_nothing_else(live):
     press = msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": uuid_of(button), "updates": {"value": True}})
     try:
         driver.arrive("drives")
-        with Page(live, "watches") as page:
+        with opened(live, "watches") as page:
             page.send(press)
             page.send(msgspec.msgpack.encode(CAMERA | {"position": [2.0, 2.0, 2.0]}))
             until(lambda: np.allclose(page.camera.position, 2.0))
@@ -155,13 +171,47 @@ def test_a_page_that_only_watches_moves_its_camera_and_nothing_else(live):
 def test_what_was_asked_for_is_shown_once_the_view_opens_and_again_after_a_reload(live, course):
     assert not ask(live, "late", {"story": STORY, "at_s": 0.0})
     for _ in range(2):
-        with Page(live, "late") as page:
+        with opened(live, "late") as page:
             until(lambda page=page: page.own(f"/replay/objects/{course.names[0]}"))
     ask(live, "late")
 
 
+class SlowLibrary:
+    """A library whose meshes come when they are released."""
+
+    def __init__(self, library):
+        self._library, self.is_asked, self.release = library, threading.Event(), threading.Event()
+
+    def viewer_glb(self, name):
+        self.is_asked.set()
+        self.release.wait(60)
+        return self._library.viewer_glb(name)
+
+    def __getattr__(self, name):
+        return getattr(self._library, name)
+
+
+def test_a_page_that_is_reloaded_while_a_replay_opens_shows_it_in_its_new_view(server, library, course):
+    address, headers = f"ws://127.0.0.1:{server.get_port()}", {SECRET_HEADER: server.secret}
+    slow = SlowLibrary(library)
+    views = PageViews(slow, lambda _: "page", lambda: None, SimpleNamespace(is_warm=True), set)
+    views.start(None)
+    views.ask("page", Wish(Replay(Stories().trajectory(STORY))))  # paused: nothing but the reload draws it anew
+    try:
+        with Page(server, address, headers) as page, Page(server, address, headers) as again:
+            views.add_client(page.client)
+            assert slow.is_asked.wait(60)
+            views.add_client(again.client)
+            slow.release.set()
+            until(lambda: again.own(f"/replay/objects/{course.names[0]}"))
+            until(lambda: np.allclose(again.own("/lamp").position, course.states[0].light.position, atol=1e-5))
+    finally:
+        slow.release.set()
+        views.close()
+
+
 def test_a_page_chooses_between_meshes_and_beliefs(live, shown):
-    with Page(live, "page") as page:
+    with opened(live, "page") as page:
         until(lambda: page.hides("/episode/estimate/tracked"))
         ask(live, "page", shows="beliefs")
         until(lambda: page.hides("/objects") and page.hides("/shadows"))

@@ -6,7 +6,7 @@ from app.viewer.nodes.room import VIEW_FROM
 from app.viewer.private_server import PrivateViser
 from tests.app.conftest import until
 from tests.app.viewer.conftest import BOTTLE, BOX
-from tests.app.viewer.panels.test_episode_panel import found, job, sketch, stepped
+from tests.app.viewer.test_episodes import found, job, sketch, stepped
 
 
 def test_a_dropped_object_falls_and_one_in_another_goes_back(live, browser, shown):

@@ -1,4 +1,4 @@
-"""Visitors with a browser made of air, and a renderer that answers when told to."""
+"""Neural pictures in the 3D view: visitors with a browser made of air, and a renderer that answers when it is to."""
 
 from concurrent.futures import Future
 from types import SimpleNamespace
@@ -8,7 +8,7 @@ import pytest
 
 from app.processes.messages.neural_messages import DrawnView
 from app.processes.process_client import ProcessUnavailable
-from app.viewer.panels.neural_panel import NeuralPanel
+from app.viewer.neural_panel import REST_S, STEPS, HiddenNodes, NeuralPanel, Refinement
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -121,7 +121,7 @@ def browser(room):
 
 
 def test_pictures_get_sharper_and_replace_the_meshes_until_switched_off(room, browser):
-    room.panel.scene_moved()
+    room.panel.moved()
     assert room.renderer.orders == []  # nobody asked
     room.panel.switch(browser.client_id, is_on=True)
     orders = [room.renderer.answer(number) for number in range(3)]
@@ -155,7 +155,7 @@ def test_the_light_and_the_view_are_followed(room, browser):
     room.panel.switch(browser.client_id, is_on=True)
     room.renderer.answer(0)
     room.light = Light(np.array([1.0, 0, 0.5]))
-    room.panel.scene_moved()
+    room.panel.moved()
     order = room.renderer.answer(1)
     np.testing.assert_allclose(order.state.light.direction, room.light.direction, atol=1e-12)
     assert not order.is_sharp
@@ -174,7 +174,7 @@ def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
     until(lambda: browser.hides() == {"/table", "/pusher", "/shadows", f"/objects/{B}"})
     assert f"the {A}" in browser.notifications[0].body
     room.fields = {A, B}  # it was trained meanwhile
-    room.panel.scene_moved()
+    room.panel.moved()
     room.renderer.answer(1)
     until(lambda: f"/objects/{A}" in browser.hides())
 
@@ -185,7 +185,7 @@ def test_where_the_renderer_fails_the_switch_goes_back_and_says_why(room, browse
     until(lambda: browser.notifications)
     assert "stopped unexpectedly" in browser.notifications[0].body
     assert browser.hides() == set()
-    room.panel.scene_moved()
+    room.panel.moved()
     assert len(room.renderer.orders) == 1  # it is off
 
 
@@ -211,3 +211,113 @@ def test_who_left_gets_no_more_pictures(room, browser):
     room.renderer.answer(1)
     until(lambda: other.pictures)
     assert browser.pictures == []
+
+
+@pytest.fixture
+def view():
+    refinement = Refinement()
+    refinement.moved(10.0)
+    return refinement
+
+
+def test_steps_grow_sharper():
+    assert [step.is_sharp for step in STEPS] == [False, True, True]
+    assert [step.rows for step in STEPS] == sorted(step.rows for step in STEPS)
+    assert 96 <= STEPS[0].rows <= 128
+    assert 360 <= STEPS[-1].rows <= 480
+
+
+def test_coarse_at_once_then_sharper_after_a_rest(view):
+    assert view.due_at() == 10.0
+    ticket = view.order()
+    assert view.due_at() is None
+    assert view.accept(ticket, is_there=True)
+    for step in (1, 2):
+        assert view.due_at() == 10.0 + REST_S
+        ticket = view.order()
+        assert ticket.step == step
+        assert view.due_at() is None
+        assert view.accept(ticket, is_there=True)
+    assert view.due_at() is None
+    view.moved(20.0)
+    assert view.due_at() == 20.0
+
+
+def test_while_things_move_one_coarse_picture_after_the_other_is_shown(view):
+    for number in range(5):
+        ticket = view.order()
+        view.moved(11.0 + number)
+        assert view.due_at() is None  # one at a time
+        assert view.accept(ticket, is_there=True)
+        assert view.due_at() == 11.0 + number
+        assert view.order().step == 0
+        view.accept(view.order(), is_there=False)
+
+
+def test_a_sharp_picture_of_the_past_is_neither_waited_for_nor_shown(view):
+    view.accept(view.order(), is_there=True)
+    sharp = view.order()
+    assert sharp.step == 1
+    view.moved(12.0)
+    assert view.due_at() == 12.0
+    coarse = view.order()
+    assert not view.accept(sharp, is_there=False)
+    assert not view.accept(sharp, is_there=True)
+    assert view.due_at() is None  # the coarse one still comes
+    assert view.accept(coarse, is_there=True)
+
+
+def test_a_sharp_picture_that_comes_after_a_movement_is_not_shown(view):
+    view.accept(view.order(), is_there=True)
+    sharp = view.order()
+    view.moved(12.0)
+    assert not view.accept(sharp, is_there=True)
+    assert view.due_at() == 12.0
+
+
+def test_what_did_not_come_is_ordered_again(view):
+    assert not view.accept(view.order(), is_there=False)
+    assert view.due_at() == 10.0
+
+
+def test_where_no_picture_can_be_made_nothing_is_due_before_a_movement(view):
+    view.give_up(view.order())
+    assert view.due_at() is None
+    view.moved(13.0)
+    assert view.due_at() == 13.0
+
+
+@pytest.fixture
+def visitor():
+    return Browser()
+
+
+def test_a_node_is_hidden_until_nobody_wants_that(visitor):
+    hidden = HiddenNodes(visitor)
+    hidden.hide("a", {"/x", "/y"})
+    hidden.hide("b", {"/y"})
+    assert visitor.hides() == {"/x", "/y"}
+    hidden.hide("a", ())
+    assert visitor.hides() == {"/y"}
+    hidden.hide("b", ())
+    assert visitor.hides() == set()
+
+
+def test_a_node_of_the_browsers_own_stays_the_same(visitor):
+    visitor.hidden["/x"] = mine = Node(visible=True)
+    hidden = HiddenNodes(visitor)
+    hidden.hide("a", {"/x"})
+    assert visitor.hidden["/x"] is mine
+    assert not mine.visible
+    hidden.hide("a", ())
+    assert mine.visible
+    assert not mine.is_removed
+
+
+def test_what_somebody_else_has_covered_meanwhile_is_left_to_them(visitor):
+    hidden = HiddenNodes(visitor)
+    hidden.hide("a", {"/x"})
+    visitor.hidden["/x"] = other = Node(visible=False)
+    hidden.hide("a", ())
+    assert not other.visible
+    assert not other.is_removed

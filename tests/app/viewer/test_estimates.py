@@ -1,16 +1,23 @@
+"""Estimates in the 3D view: what is drawn of an estimator at work, and when."""
+
 import numpy as np
 import pytest
 
+from app.jobs.job import Job, JobChanged, JobView
+from app.services.event_hub import CurrentScene
+from app.viewer.job_panels import EstimatePanel
 from app.viewer.nodes.estimate_nodes import GHOSTS, EstimateNodes
-from app.viewer.nodes.label_layout import LINE, Label
-from app.viewer.nodes.light_marker import AT
-from app.viewer.nodes.room import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
+from app.viewer.nodes.room import AT, LINE, VIEW_AT, VIEW_FOV_RAD, VIEW_FROM, Label
+from app.viewer.nodes.scene_nodes import SceneNodes
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.progress import Progress
+from tests.app.conftest import until
+from tests.app.storage.test_database import record
+from tests.app.viewer.conftest import ViewerDriver
 
 BOX, UNKNOWN = "003_cracker_box", "055_baseball"  # the second has no mesh here
 LIGHT = Light(np.array([0.6, 0, 0.8]))
@@ -34,10 +41,6 @@ def tried(count, names=2):
     return Pose(rng.normal(size=(count, names, 3)), turns / np.linalg.norm(turns, axis=-1, keepdims=True))
 
 
-def step(guess=None, candidates=None, lights=None, estimate=None):
-    return EstimateStep(Progress(1, 2, ""), "objects", guess or state(), candidates, lights, estimate=estimate)
-
-
 def judged(doubt="", position=0.001, turn=0.02):
     doubts = (doubt, "")
     return EstimatedState(state(), np.full(2, position), np.full(2, turn), 0.01, doubts, doubt)
@@ -58,7 +61,7 @@ def verdicts(driver, kind):
 @pytest.mark.parametrize("count", [3, 24, 50])
 def test_candidates_of_each_object_are_drawn_where_they_were_tried_up_to_a_number(drawing, driver, count):
     candidates = tried(count)
-    drawing.show(step(candidates=candidates))
+    drawing.show(state(), candidates)
     for n, name in enumerate((BOX, UNKNOWN)):
         node = tried_node(driver, name)
         assert node.visible
@@ -66,14 +69,14 @@ def test_candidates_of_each_object_are_drawn_where_they_were_tried_up_to_a_numbe
         own = candidates.position[:, n].astype(np.float32)
         assert {tuple(p) for p in node.batched_positions} <= {tuple(p) for p in own}
         assert len(np.unique(node.batched_positions, axis=0)) == min(count, GHOSTS)
-    drawing.show(step())
+    drawing.show(state())
     assert not driver.shows(f"/estimate/tried/{BOX}")
 
 
 def test_the_guess_and_its_light_follow_and_what_was_not_looked_for_is_hidden(drawing, driver):
-    drawing.show(step(state(z=-1.0)))
+    drawing.show(state(z=-1.0))
     assert not driver.shows(f"/estimate/guess/{BOX}")
-    drawing.show(step())
+    drawing.show(state())
     assert driver.shows(f"/estimate/guess/{BOX}")
     np.testing.assert_allclose(guess(driver).batched_positions, [[0.1, -0.05, 0.1]], rtol=1e-6)
     cube, label = driver.node("/estimate/light"), driver.node("/estimate/light_name")
@@ -84,20 +87,20 @@ def test_the_guess_and_its_light_follow_and_what_was_not_looked_for_is_hidden(dr
 
 def test_lights_that_are_tried_are_drawn_while_there_are_any(drawing, driver):
     lights = np.array([[0, 0, 1.0], [0.6, 0, 0.8]])
-    drawing.show(step(lights=lights))
+    drawing.show(state(), lights=lights)
     assert driver.shows("/estimate/tried_lights")
     places = driver.node("/estimate/tried_lights").batched_positions
     assert {tuple(p) for p in places} == {tuple(p) for p in (AT * lights).astype(np.float32)}
-    drawing.show(step())
+    drawing.show(state())
     assert not driver.shows("/estimate/tried_lights")
 
 
 def test_meshes_are_sent_once(drawing, driver):
-    drawing.show(step())
+    drawing.show(state())
     before = guess(driver)
-    drawing.show(step(candidates=tried(5)))
+    drawing.show(state(), tried(5))
     assert guess(driver) is before
-    drawing.show(step(state((BOX,))))
+    drawing.show(state((BOX,)))
     assert driver.below("/estimate/guess") == {BOX}
     assert guess(driver) is not before
 
@@ -106,7 +109,7 @@ def test_meshes_are_sent_once(drawing, driver):
 def test_uncertainty_is_two_deviations_but_never_too_small_or_too_large_to_see(
     drawing, driver, library, position, turn
 ):
-    drawing.show(step(estimate=judged(position=position, turn=turn)))
+    drawing.show(state(), estimate=judged(position=position, turn=turn))
     balls, sectors, words = (verdicts(driver, kind) for kind in ("position", "turn", "words"))
     assert balls[0].radius == pytest.approx(np.clip(2 * position, 0.006, 0.1))
     half = np.clip(2 * turn, 0.06, np.pi)
@@ -119,20 +122,20 @@ def test_uncertainty_is_two_deviations_but_never_too_small_or_too_large_to_see(
 
 
 def test_doubted_objects_are_drawn_in_another_colour_with_the_reason(drawing, driver):
-    drawing.show(step(estimate=judged("it is hardly visible")))
+    drawing.show(state(), estimate=judged("it is hardly visible"))
     doubted, trusted = guess(driver).batched_colors, guess(driver, UNKNOWN).batched_colors
     assert not np.array_equal(doubted, trusted)
     texts = [node.text for node in verdicts(driver, "words")]
     assert texts[0] == "DOUBTFUL: it is hardly visible"
     assert texts[1].startswith("± 2 mm, ± 2.3")
     assert driver.node("/estimate/light_name").text == "estimated light ± 1.1° (2σ)"
-    drawing.show(step())  # another estimate begins: no verdict is left
+    drawing.show(state())  # another estimate begins: no verdict is left
     assert driver.below(f"/estimate/verdict/{BOX}") == set()
     np.testing.assert_array_equal(guess(driver).batched_colors, guess(driver, UNKNOWN).batched_colors)
 
 
 def test_words_cover_neither_names_nor_each_other(drawing, driver):
-    drawing.show(step(estimate=judged()))
+    drawing.show(state(), estimate=judged())
     view = Camera.look_at("view", VIEW_FROM, VIEW_AT, fov_y_deg=float(np.rad2deg(VIEW_FOV_RAD)))
     feet = [node.position for node in verdicts(driver, "words")] + [NAMES[BOX].anchor_m]
     heights = np.sort(view.project(np.array(feet))[:, 1] / view.height)
@@ -141,7 +144,7 @@ def test_words_cover_neither_names_nor_each_other(drawing, driver):
 
 def test_what_is_not_on_the_table_is_named(server, driver, library):
     drawing = EstimateNodes(server, library, lambda: {UNKNOWN: NAMES[UNKNOWN]})
-    drawing.show(step(estimate=judged("it is hardly visible")))
+    drawing.show(state(), estimate=judged("it is hardly visible"))
     texts = [node.text for node in verdicts(driver, "words")]
     assert texts[0] == "Cracker box: DOUBTFUL: it is hardly visible"
     assert texts[1].startswith("± 2 mm")
@@ -149,7 +152,7 @@ def test_what_is_not_on_the_table_is_named(server, driver, library):
 
 def test_candidates_can_be_hidden_and_everything_removed(drawing, driver):
     drawing.show_candidates(False)
-    drawing.show(step(candidates=tried(4), lights=np.array([[0, 0, 1.0]])))
+    drawing.show(state(), tried(4), np.array([[0, 0, 1.0]]))
     assert not driver.shows(f"/estimate/tried/{BOX}")
     assert not driver.shows("/estimate/tried_lights")
     assert not drawing.is_empty
@@ -161,9 +164,9 @@ def test_candidates_can_be_hidden_and_everything_removed(drawing, driver):
 
 
 def test_estimates_of_things_on_their_way_are_drawn_without_a_word(drawing, driver):
-    drawing.show(step(candidates=tried(5), estimate=judged()))
+    drawing.show(state(), tried(5), estimate=judged())
     before = guess(driver)
-    drawing.follow(judged("it is hardly visible"))
+    drawing.follow(state(), ("it is hardly visible", ""))
     assert guess(driver) is before
     assert driver.below(f"/estimate/verdict/{BOX}") == set()
     assert not driver.shows(f"/estimate/tried/{BOX}")
@@ -173,12 +176,124 @@ def test_estimates_of_things_on_their_way_are_drawn_without_a_word(drawing, driv
 
 def test_another_drawing_has_its_own_nodes_and_colour_and_may_do_without_light(server, driver, library):
     drawing = EstimateNodes(server, library, root="/elsewhere", colour=(1, 2, 3), has_light=False)
-    drawing.show(step(candidates=tried(4), lights=np.array([[0, 0, 1.0]]), estimate=judged()))
+    drawing.show(state(), tried(4), np.array([[0, 0, 1.0]]), judged())
     assert driver.below("/elsewhere/guess") == driver.below("/elsewhere/tried") == {BOX, UNKNOWN}
     assert driver.below("/estimate") == set()
     assert driver.node("/elsewhere/light") is None
     assert not driver.shows("/elsewhere/tried_lights")
-    drawing.show(step())
+    drawing.show(state())
     assert tuple(driver.node(f"/elsewhere/guess/{BOX}").batched_colors) == (1, 2, 3)
     drawing.clear()
     assert drawing.is_empty
+
+
+def job(state="running", scene="s", name="a", **changes):
+    params = {"mode": "first", "seed": 0, "of": {"scene": scene}, "names": [BOX], "cameras": ["0", "1"]}
+    return Job(name, "estimate", params, state, **{"done": 3, "total": 6, "note": "Looking", **changes})
+
+
+def step(number=1, estimate=None, x=0.1):
+    moved = SceneState((BOX,), Pose(np.array([[0.1 + x, 0, 0.1]]), UPRIGHT[None]), LIGHT, None)
+    return EstimateStep(Progress(number, 6, ""), "objects", moved, losses=(1 / number,), estimate=estimate)
+
+
+class Room:
+    """A view whose service is made of air."""
+
+    def __init__(self, server, library):
+        self.gui = ViewerDriver(server)
+        self.table = SceneNodes(server, library, lambda *_: None, lambda *_: None)
+        self.drawing = EstimateNodes(server, library)
+        self.panel = EstimatePanel(server, self.table, self.drawing)
+
+    def see(self, of, what):
+        self.panel.show(JobView(of, what))
+        until(lambda: self.panel.is_idle)
+
+    def guess(self):
+        node = self.gui.node(f"/estimate/guess/{BOX}")
+        return None if node is None else node.batched_positions
+
+
+@pytest.fixture
+def room(server, library):
+    room = Room(server, library)
+    room.panel.start(record("s"))
+    until(lambda: room.panel.is_idle)
+    yield room
+    room.panel.close()
+    room.panel.close()
+
+
+def test_steps_are_drawn(room):
+    room.see(job(), step())
+    until(lambda: not room.drawing.is_empty)
+    room.see(job(), step(2, x=0.2))
+    until(lambda: np.allclose(room.guess(), [[0.3, 0, 0.1]]))
+
+
+def test_what_an_estimate_has_drawn_is_cleared_once_it_is_over(room):
+    room.see(job(), step())
+    room.gui.press("Clear")
+    assert not room.drawing.is_empty  # it still runs
+    room.panel.show(JobChanged(1, job("done", result={"trusted": True})))
+    until(lambda: room.panel.is_idle)
+    room.gui.press("Clear")
+    until(lambda: room.drawing.is_empty)
+
+
+def test_the_true_light_is_told_on_demand_only_and_is_back_when_the_estimate_is_gone(room):
+    assert room.gui.shows("/light")
+    room.see(job(), step())
+    until(lambda: not room.gui.shows("/light"))
+    room.gui.set("Show true light", True)
+    until(lambda: room.gui.shows("/light"))
+    assert room.gui.shows("/light_name")
+    assert room.gui.node("/light_name").text == "true light"
+    assert tuple(room.gui.node("/light").colors) != tuple(room.gui.node("/estimate/light").colors)
+    room.panel.show(JobChanged(1, job("cancelled")))
+    until(lambda: room.drawing.is_empty)
+    until(lambda: not room.gui.shows("/light_name"))
+    assert room.gui.shows("/light")
+
+
+def test_only_what_is_about_the_scene_on_view_is_drawn(room):
+    room.see(job(scene="other"), step())
+    assert room.drawing.is_empty
+    room.see(job(scene=None, name="upload"), step())
+    until(lambda: not room.drawing.is_empty)
+    room.panel.show(JobChanged(1, job("done", scene=None, name="upload", result={"trusted": False})))
+    until(lambda: room.panel.is_idle)
+    room.see(job(), step())
+    assert not room.drawing.is_empty
+    room.panel.show(CurrentScene(record()))
+    until(lambda: room.drawing.is_empty)
+
+
+def test_one_that_waits_does_not_take_the_view_from_one_that_runs(room):
+    room.see(job(), step())
+    room.panel.show(JobChanged(1, job("queued", name="b")))
+    until(lambda: room.panel.is_idle)
+    assert not room.drawing.is_empty
+
+
+def test_steps_of_jobs_of_other_kinds_are_not_drawn(room):
+    other = Job("e", "episode", {"scene": "s", "names": [BOX]}, "running")
+    room.panel.show(JobView(other, step()))
+    room.panel.show(JobChanged(1, other))
+    assert room.panel.is_idle
+    assert room.drawing.is_empty
+
+
+def test_of_one_that_failed_nothing_stays(room):
+    room.see(job(), step())
+    room.panel.show(JobChanged(1, job("failed", error="mask of x is empty.")))
+    until(lambda: room.drawing.is_empty)
+
+
+def test_a_defect_in_drawing_does_not_end_the_view(room, monkeypatch):
+    with monkeypatch.context() as broken:
+        broken.setattr(room.drawing, "show", lambda *_: 1 / 0)
+        room.see(job(), step())
+    room.see(job(), step(2, EstimatedState(state((BOX,)), np.ones(1), np.ones(1), 0.1, ("",), "")))
+    until(lambda: room.gui.below(f"/estimate/verdict/{BOX}"))

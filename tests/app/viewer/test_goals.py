@@ -8,8 +8,8 @@ import pytest
 
 from app.services.event_hub import CurrentScene
 from app.services.goals.goals import Draft, DraftChanged, NoDraft
+from app.viewer.goal_panel import WRONG, GoalPanel
 from app.viewer.nodes.episode_nodes import GOAL
-from app.viewer.panels.goal_panel import WRONG, GoalPanel
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
 from tests.app.conftest import until

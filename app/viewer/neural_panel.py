@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
@@ -14,15 +15,13 @@ import viser
 from app.processes.messages.neural_messages import DrawnView, DrawView, NeuralAnswer
 from app.processes.process_client import ProcessClient
 from app.processes.render_cameras import view_camera
-from app.viewer.nodes.hidden_nodes import HiddenNodes
-from app.viewer.panels.panel import Panel
-from app.viewer.panels.refinement import STEPS, Refinement, RenderTicket
+from app.viewer.drawing import Panel
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import SceneState
 
 WARM_UP = "The renderer is loading, which can take half a minute the first time; until then you see meshes."
-_TELL_AFTER_S = 1.0
+_LATE_S = 1.0
 _NOTHING_M = 100.0  # depth where a ray meets nothing
 _BEHIND_M = 0.003  # pictures lie that much farther away, so that what stands on the table is not half in it
 _JPEG_QUALITY = {False: 75, True: 92}  # by whether a picture is sharp
@@ -46,6 +45,129 @@ class _Answer:
     names: tuple[str, ...]
     root: str
     future: Future[NeuralAnswer]
+
+
+class HiddenNodes:
+    """Hides nodes in one browser, each for as long as somebody wants that. Any thread may call.
+
+    A node that all browsers see is covered by an invisible one of the same path that is this browser's own. A node of
+    its own would be removed by that, with all below it; it becomes invisible itself.
+
+    Args:
+        client: the browser.
+    """
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._scene = client.scene
+        self._lock = threading.Lock()
+        self._wanted: dict[str, frozenset[str]] = {}
+        self._covers: dict[str, viser.SceneNodeHandle | None] = {}  # by path; None for a node of its own
+
+    def hide(self, by: str, paths: Collection[str]) -> None:
+        """Hide some paths, and no longer others, as far as `by` is concerned."""
+        with self._lock:
+            self._wanted[by] = frozenset(paths)
+            every = frozenset().union(*self._wanted.values())
+            for path in self._covers.keys() - every:
+                self._uncover(path)
+            for path in every:
+                self._cover(path)
+
+    def _cover(self, path: str) -> None:
+        node = self._scene.get_handle_by_name(path)
+        if node is None:
+            self._covers[path] = self._scene.add_frame(path, show_axes=False, visible=False)
+        elif node is not self._covers.get(path):
+            self._covers[path] = None
+            if node.visible:
+                node.visible = False
+
+    def _uncover(self, path: str) -> None:
+        cover, node = self._covers.pop(path), self._scene.get_handle_by_name(path)
+        if node is not None and node is cover:
+            node.remove()
+        elif node is not None and cover is None:
+            node.visible = True  # else somebody else has covered it meanwhile
+
+
+REST_S = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One stage of refinement.
+
+    Attributes:
+        rows: height of the picture [px].
+        is_sharp: whether it is rendered with fine sampling and with depth.
+    """
+
+    rows: int
+    is_sharp: bool
+
+
+STEPS = (Step(112, is_sharp=False), Step(256, is_sharp=True), Step(480, is_sharp=True))
+
+
+@dataclass(frozen=True, slots=True)
+class RenderTicket:
+    """A requested picture.
+
+    Attributes:
+        movement: number of the movement after which it was requested.
+        step: index into `STEPS`.
+    """
+
+    movement: int
+    step: int
+
+
+class Refinement:
+    """How careful the next picture of a view should be: coarse while something moves, sharper once it rests.
+
+    Times are in seconds of one clock; one thread at a time.
+    """
+
+    def __init__(self) -> None:
+        self._movement = 0
+        self._moved_at = 0.0
+        self._step = 0
+        self._ordered: RenderTicket | None = None
+
+    def moved(self, now: float) -> None:
+        """Something that the view shows has moved, or the view itself."""
+        self._movement += 1
+        self._moved_at, self._step = now, 0
+
+    def due_at(self) -> float | None:
+        """When the next picture should be ordered; None while an ordered one is worth waiting for, and at the end.
+
+        A quick picture is waited for even while things move on: that sets the pace. A sharp one is not.
+        """
+        waits = self._ordered is not None and (self._ordered.step == 0 or self._ordered.movement == self._movement)
+        if waits or self._step == len(STEPS):
+            return None
+        return self._moved_at if self._step == 0 else self._moved_at + REST_S
+
+    def order(self) -> RenderTicket:
+        """Note that the next picture is being made; whatever was ordered before does not count any more."""
+        self._ordered = RenderTicket(self._movement, self._step)
+        return self._ordered
+
+    def accept(self, ticket: RenderTicket, *, is_there: bool) -> bool:
+        """Note the answer to an order, with a picture or without; returns whether the picture should be shown."""
+        if ticket != self._ordered:
+            return False
+        self._ordered = None
+        is_fresh = ticket.movement == self._movement
+        if is_there and is_fresh:
+            self._step = ticket.step + 1
+        return is_there and (is_fresh or ticket.step == 0)
+
+    def give_up(self, ticket: RenderTicket) -> None:
+        """Note that no picture can be made before something moves."""
+        if ticket == self._ordered:
+            self._ordered, self._step = None, len(STEPS)
 
 
 class ClientView:
@@ -73,7 +195,7 @@ class ClientView:
             return None if self._is_clear else 0.0
         if self.answers:
             return 0.0
-        late_at = None if self.waiting_since is None or self._waiting else self.waiting_since + _TELL_AFTER_S
+        late_at = None if self.waiting_since is None or self._waiting else self.waiting_since + _LATE_S
         times = [at for at in (self.refinement.due_at(), late_at) if at is not None]
         return min(times, default=None)
 
@@ -104,11 +226,11 @@ class ClientView:
         self._is_clear = False
 
     def clear(self) -> None:
-        """Back to meshes."""
+        """Show meshes again."""
         self.hidden.hide(_NEURAL, ())
         self.client.scene.set_background_image(None)
         self._stop_waiting()
-        self.tell_meshes(())
+        self.notify_meshes(())
         self._is_clear = True
 
     def refuse(self, reason: str) -> None:
@@ -117,17 +239,15 @@ class ClientView:
         self.clear()
         self.client.add_notification("No neural fields", reason, color="orange", auto_close_seconds=10.0)
 
-    def tell_late(self, now: float) -> None:
+    def notify_delay(self, now: float) -> None:
         """Say that the renderer takes its time, if it does."""
-        if self.waiting_since is not None and self._waiting is None and now >= self.waiting_since + _TELL_AFTER_S:
+        if self.waiting_since is not None and self._waiting is None and now >= self.waiting_since + _LATE_S:
             self._waiting = self.client.add_notification("Neural fields", WARM_UP, loading=True)
 
-    def tell_meshes(self, names: tuple[str, ...]) -> None:
-        """Say which objects have no field."""
-        if names == self._meshes:
-            return
-        self._meshes = names
-        if names:
+    def notify_meshes(self, names: tuple[str, ...]) -> None:
+        """Say which objects have no field, once."""
+        before, self._meshes = self._meshes, names
+        if names and names != before:
             text = f"Without a field, so still shown as meshes: {', '.join(names)}. Fields are trained under Fields."
             self.client.add_notification("Neural fields", text, auto_close_seconds=8.0)
 
@@ -160,10 +280,9 @@ class NeuralPanel(Panel):
 
     def add_client(self, client: viser.ClientHandle) -> None:
         """Look after a new browser."""
-        view = ClientView(client)
-        client.camera.on_update(lambda _: self._moved(view))
+        client.camera.on_update(lambda _: self.moved(client.client_id))
         with self._thread.changed:
-            self._views[client.client_id] = view
+            self._views[client.client_id] = ClientView(client)
 
     def remove_client(self, client: viser.ClientHandle) -> None:
         """Forget a browser that has left."""
@@ -182,27 +301,14 @@ class NeuralPanel(Panel):
             view = self._views.get(client)
             if view is not None and view.is_on != is_on:
                 view.is_on = is_on
-                self._moved(view)
+                self.moved(client)
 
-    def view_moved(self, client: int) -> None:
-        """What one browser shows has changed. Any thread may call."""
-        with self._thread.changed:
-            view = self._views.get(client)
-            self._moved(*([] if view is None else [view]))
-
-    def scene_moved(self) -> None:
-        """What is drawn has changed. Any thread may call; it never waits for a picture."""
-        with self._thread.changed:
-            self._moved(*self._views.values())
-
-    def _moved(self, *views: ClientView) -> None:
-        with self._thread.changed:
-            for view in views:
-                view.refinement.moved(time.monotonic())
-            self._thread.wake()
-
-    def _store(self, event: object) -> bool:
-        return False  # movements come by `scene_moved`
+    def moved(self, client: int | None = None) -> None:
+        """Note that what one browser shows has changed, or all; any thread may call, and never waits for a picture."""
+        with self._thread.changing():
+            for view in self._views.values():
+                if client in (None, view.client.client_id):
+                    view.refinement.moved(time.monotonic())
 
     def _draw(self) -> None:
         now = time.monotonic()
@@ -227,7 +333,7 @@ class NeuralPanel(Panel):
         if not view.is_on:
             view.clear()
             return
-        view.tell_late(now)
+        view.notify_delay(now)
         with self._thread.changed:
             due_at = view.refinement.due_at()
             ticket = view.refinement.order() if due_at is not None and due_at <= now else None
@@ -242,7 +348,7 @@ class NeuralPanel(Panel):
             with self._thread.changed:
                 view.refinement.give_up(ticket)
             return
-        view.tell_meshes(tuple(self._label(name) for name in others))
+        view.notify_meshes(tuple(self._label(name) for name in others))
         if not self._link.is_warm and view.waiting_since is None:
             view.waiting_since = now
         order = DrawView(f"view-{view.client.client_id}", state, camera, step.is_sharp)
@@ -258,9 +364,8 @@ class NeuralPanel(Panel):
         return SceneState(names, state.poses[rows], state.light, state.pusher), others
 
     def _receive(self, view: ClientView, answer: _Answer) -> None:
-        with self._thread.changed:
+        with self._thread.changing():
             view.answers.append(answer)
-            self._thread.wake()
 
     def _take(self, view: ClientView, answer: _Answer) -> None:
         error = answer.future.exception()

@@ -1,4 +1,4 @@
-"""The folder in the panel, with predictions and pushes that are told by the test."""
+"""Predicted pushes in the 3D view: what is drawn, what is chosen, and what came of them."""
 
 from concurrent.futures import Future
 from dataclasses import replace
@@ -12,21 +12,170 @@ from app.processes.messages.scene_messages import SceneChanged, SceneRecord
 from app.processes.process_client import ProcessUnavailable
 from app.services.event_hub import CurrentScene, Notice
 from app.services.fields import MissingFields
-from app.services.pushes import MAX_ACTIONS
+from app.services.pushes import MAX_ACTIONS, Outcome
 from app.services.scenes import SceneHeld
-from app.viewer.nodes.push_nodes import PushNodes
-from app.viewer.panels.push_controls import PATH
-from app.viewer.panels.push_panel import PushPanel
+from app.viewer.nodes.push_nodes import MOST, SPACING_M, TRAIL, PushNodes, Waypoints
+from app.viewer.push_panel import PATH, PushPanel, PushPrediction, report
 from osfcore.errors import OsfError
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_REACH_M
 from tests.app.conftest import until
+from tests.app.storage.test_database import record
 from tests.app.viewer.conftest import ViewerDriver
 
-BOX, CAN = "003_cracker_box", "005_tomato_soup_can"
+BOX, CAN, GONE = "003_cracker_box", "005_tomato_soup_can", "my_thing"
+COUNT = 11
+
+
+@pytest.fixture
+def drawing(server, library):
+    return PushNodes(server, library)
+
+
+@pytest.fixture
+def rollouts():
+    """Of three objects the first slides from its fourth action on, the second stays, the third turns by 90 degrees."""
+    positions = np.zeros((1, COUNT, 3, 3))
+    positions[0, :, 0, 0] = 0.02 * np.maximum(np.arange(COUNT) - 4, 0)
+    positions[0, :, 1:, 1] = [0.2, -0.2]
+    quaternions = np.tile([1.0, 0, 0, 0], (1, COUNT, 3, 1))
+    half = np.linspace(0, np.pi / 4, COUNT)
+    quaternions[0, :, 2] = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=1)
+    quaternions[0, 1::2, 2] *= -1  # the same rotations
+    pusher = np.linspace([-0.2, 0, 0.06], [0.1, 0, 0.06], COUNT)[None]
+    return Rollouts((BOX, CAN, GONE), positions, quaternions, pusher)
+
+
+def ghost(driver, name):
+    node = driver.node(f"/push/ghost/{name}")
+    return np.asarray(node.batched_positions)[0], np.asarray(node.batched_wxyzs)[0]
+
+
+def test_what_moves_gets_a_ghost_at_the_end_and_a_way(drawing, driver, rollouts):
+    drawing.show(rollouts)
+    assert drawing.moving == (BOX, GONE)
+    np.testing.assert_allclose(ghost(driver, BOX)[0], [0.12, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(driver.node("/push/pusher").position, [0.1, 0, 0.06], atol=1e-6)
+    assert driver.shows("/push/ways")
+    assert driver.node("/push/ways").points.shape == (2 * (COUNT - 1), 2, 3)
+    assert driver.node("/push/ways").points[0, 0, 2] > 0.1  # above the box
+
+
+def test_the_trail_is_spread_over_the_way_and_not_over_the_wait(drawing, driver, rollouts):
+    drawing.show(rollouts)
+    assert driver.below("/push/trail") == {BOX}  # what only turns has none
+    x = np.asarray(driver.node(f"/push/trail/{BOX}").batched_positions)[:, 0]
+    assert len(x) == TRAIL
+    assert x.min() > 0.01
+    assert x.max() < 0.12
+
+
+def test_ghosts_move_with_time_by_the_shorter_way(drawing, driver, rollouts):
+    drawing.show(rollouts)
+    drawing.at(5.5)
+    position, _ = ghost(driver, BOX)
+    np.testing.assert_allclose(position, [0.03, 0, 0], atol=1e-6)
+    _, quaternion = ghost(driver, GONE)
+    half = np.pi / 4 * 5.5 / 10
+    np.testing.assert_allclose(np.abs(quaternion), [np.cos(half), 0, 0, np.sin(half)], atol=1e-4)
+    for step, x in ((-3, 0.0), (99, 0.12)):
+        drawing.at(step)
+        np.testing.assert_allclose(ghost(driver, BOX)[0][0], x, atol=1e-6)
+
+
+def test_truth_is_drawn_beside_it_and_all_goes_again(drawing, driver, rollouts):
+    drawing.show(rollouts)
+    light, turns = Light(np.array([0, 0, 1.0])), np.tile([1.0, 0, 0, 0], (2, 1))
+    states = [
+        SceneState((BOX, CAN), Pose(np.array([[x, 0, 0], [0, 0.2, 0]]), turns), light, None) for x in (0.0, 0.05, 0.1)
+    ]
+    drawing.show_truth(states)
+    assert driver.shows("/push/true_ways")
+    assert driver.node("/push/true_ways").points.shape == (2, 2, 3)
+    np.testing.assert_allclose(
+        driver.node("/push/true_ways").points[0, 0, 2], driver.node("/push/ways").points[0, 0, 2]
+    )
+    drawing.show_truth(())
+    assert not driver.shows("/push/true_ways")
+    drawing.plan(np.array([[0, 0], [0.1, 0.1]]))
+    drawing.clear()
+    assert drawing.moving == ()
+    assert not driver.shows("/push/pusher")
+    assert not driver.shows("/push/ways")
+    assert driver.shows("/push/plan")
+    drawing.plan(None)
+    assert not driver.shows("/push/plan")
+    drawing.at(3)  # there is nothing to move
+
+
+def test_handles_are_laid_shown_and_dragged(server, driver):
+    dragged = []
+
+    def visible():
+        return [number for number in range(MOST) if driver.shows(f"/push/waypoints/{number}")]
+
+    waypoints = Waypoints(server, lambda: dragged.append(True))
+    waypoints.lay(np.array([0.3, 0.0]), np.pi / 2)
+    np.testing.assert_allclose(waypoints.places(2), [[0.3, SPACING_M], [0.3, 2 * SPACING_M]], atol=1e-9)
+    waypoints.lay(np.array([0.3, 0.0]), 0.0)
+    assert waypoints.places(MOST).max() == PUSHER_REACH_M
+    assert visible() == []
+    waypoints.show(3)
+    assert visible() == [0, 1, 2]
+    driver.drag("/push/waypoints/0", None, None, "update")
+    assert dragged == [True]
+
+
+NOTHING = Rollouts(("x", "y"), np.zeros((1, 3, 2, 3)), np.zeros((1, 3, 2, 4)), np.zeros((1, 3, 3)))
+
+
+def trial():
+    return PushPrediction(record(revision=5), np.zeros((2, 3)), NOTHING, 0.1)
+
+
+def test_it_follows_its_own_execution_action_by_action():
+    new = trial()
+    first = new.after(record(revision=6), (record().state,), new)
+    assert not first.is_executed
+    assert len(first.truth) == 3  # the start, the way, the end
+    done = first.after(record(revision=7), (), new)
+    assert done.is_executed
+    assert len(done.truth) == 4
+    assert done.after(record(revision=7), (), None) is done
+    assert done.after(record(revision=8), (), None) is None
+
+
+def test_any_other_change_ends_it_and_old_news_do_not():
+    new = trial()
+    assert new.after(record(revision=5), (), None) is new
+    assert new.after(record(revision=6), (), None) is None
+    assert new.after(record(revision=6), (), replace(new, rollouts=replace(NOTHING))) is None
+    assert new.after(record(revision=8), (), new) is None
+
+
+def test_nothing_is_no_table():
+    assert report((), {}) == ""
+
+
+def test_before_and_after():
+    before = report([Outcome("a", 12.34, 5.0)], {"a": "A box"})
+    assert "A box" in before
+    assert "12 mm<br>5.0°" in before
+    assert "Off by" not in before
+    after = report([Outcome("a", 12.34, 5.0, 9.96, 0.0, 2.4, 5.0), Outcome("b", 0, 0, 0, 0, 0, 0)], {})
+    assert "<b>2.4 mm<br>5.0°</b>" in after
+    assert "10 mm<br>0.0°" in after
+    assert "still" in after
+
+
+def test_what_users_name_is_escaped():
+    assert "<script" not in report([Outcome("<script>", 1, 1)], {})
+    assert "&lt;b&gt;" in report([Outcome("a", 1, 1)], {"a": "<b>"})
+
+
 SOMEBODY = object()
 
 

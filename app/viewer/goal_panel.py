@@ -8,41 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from typing import Protocol
 
 import numpy as np
 import viser
 from jaxtyping import Float
 
 from app.services.event_hub import CurrentScene
-from app.services.goals.goals import Draft, DraftChanged
-from app.viewer.nodes.atomic import atomic
-from app.viewer.nodes.episode_nodes import GOAL
-from app.viewer.nodes.ghosts import mesh_of
-from app.viewer.nodes.scene_nodes import NO_TURN, Client
-from app.viewer.panels.panel import Panel, RunCommand
+from app.services.goals.goals import DraftChanged, Goals
+from app.viewer.drawing import Panel, RunCommand
+from app.viewer.nodes.episode_nodes import GOAL, add_copy
+from app.viewer.nodes.room import NO_TURN, atomic, put
+from app.viewer.nodes.scene_nodes import Client
 from osfcore.geometry.poses import Pose, quaternion_multiply
 from osfcore.objects.asset_library import AssetLibrary
 
 WRONG = (225, 30, 35)
-_OPACITY, _SCALE = 0.55, 1.015  # or a copy and the object that it lies upon would flicker
-_CELLS = 28
+_OPACITY = 0.55
 _GIZMO_M = 0.11
 _WORDS_AT = (0.0, 0.0, 0.3)
-_STILL = 1e-6  # poses that differ by less are not sent again
-
-
-class Drafts(Protocol):
-    """The goal that is being composed, one for all browsers."""
-
-    @property
-    def draft(self) -> Draft | None:
-        """As it is now."""
-        ...
-
-    def move_draft(self, poses: tuple[tuple[str, Pose], ...]) -> object:
-        """Put objects elsewhere."""
-        ...
 
 
 class GoalPanel(Panel):
@@ -60,7 +43,7 @@ class GoalPanel(Panel):
         self,
         server: viser.ViserServer,
         library: AssetLibrary,
-        goals: Drafts,
+        goals: Goals,
         commands: Executor,
         run_command: RunCommand,
     ) -> None:
@@ -149,15 +132,7 @@ class _Copy:
         self._gizmo = scene.add_transform_controls(
             path, scale=_GIZMO_M, active_axes=(True, True, False), depth_test=False
         )
-        self._shape = scene.add_mesh_simple(
-            f"{path}/shape",
-            *mesh_of(library, name, _CELLS),
-            color=GOAL,
-            opacity=_OPACITY,
-            scale=_SCALE,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        self._shape = add_copy(scene, f"{path}/shape", library, name, opacity=_OPACITY)
 
         async def drag(event: viser.TransformControlsEvent) -> None:
             self._grip += event.phase == "start"
@@ -176,16 +151,11 @@ class _Copy:
         if self._is_held:
             return
         self._laid = pose
-        for node, part, value in (
-            (self._gizmo, "position", pose.position),
-            (self._gizmo, "wxyz", NO_TURN),
-            (self._shape, "wxyz", pose.quaternion),
-        ):
-            if not np.abs(np.asarray(getattr(node, part)) - value).max() <= _STILL:  # also true for NaN
-                setattr(node, part, np.asarray(value, float))
+        put(self._gizmo, pose.position, NO_TURN)
+        put(self._shape, np.zeros(3), pose.quaternion)
 
     def colour(self, colour: tuple[int, int, int]) -> None:
-        """Tint it."""
+        """Give it a colour."""
         self._shape.color = colour
 
     def remove(self) -> None:
@@ -202,7 +172,7 @@ class _Copy:
 
 
 def _about_z(turn: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
-    """The part of a rotation that is about the vertical; none for what is no rotation."""
+    """Take the part of a rotation that is about the vertical; none for what is no rotation."""
     flat = turn * np.array([1.0, 0.0, 0.0, 1.0])
     length = float(np.linalg.norm(flat))
     return flat / length if np.isfinite(length) and length > 1e-6 else NO_TURN

@@ -1,0 +1,274 @@
+"""Estimates and episodes in the 3D view: their folders in the panel, and the threads that draw their newest events.
+
+Events come from the jobs' thread and are only stored there; drawing, at most some times a second, happens here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import viser
+
+from app.jobs.job import Job, JobChanged, JobView
+from app.processes.messages.scene_messages import SceneChanged
+from app.processes.plan_summary import PlanSketch
+from app.services import episodes, estimates
+from app.services.event_hub import CurrentScene
+from app.services.goals.goals import DraftChanged
+from app.viewer.drawing import Panel
+from app.viewer.nodes.episode_nodes import EpisodeNodes, Part
+from app.viewer.nodes.estimate_nodes import EstimateNodes
+from app.viewer.nodes.scene_nodes import SceneNodes
+from osfcore.control.events import GoalFound, Looking, Stepped
+from osfcore.estimation.steps import EstimateStep
+from osfcore.geometry.states import EstimatedState
+from osfcore.planning.costs import PoseGoal
+
+ESTIMATE_INTERVAL_S, EPISODE_INTERVAL_S = 0.1, 0.08  # least time between two drawings
+_PARTS: tuple[tuple[Part, str, str], ...] = (
+    ("goal", "Show goal", "Golden: where everything should be."),
+    ("plan", "Show plan", "Ways of the pusher, cheap ones green; purple: the best one, and where it leads."),
+    ("estimate", "Show estimate", "Where the cameras have found objects and light; what is doubted is orange."),
+)
+
+
+def takes_view(job: Job, shown: Job | None) -> bool:
+    """Decide whether a job that has changed takes the view from the one that is shown; one that waits does not."""
+    if job.is_finished:  # else one that is renamed would take the place of what is drawn
+        return shown is not None and shown.id == job.id
+    return shown is None or shown.id == job.id or shown.is_finished or job.state == "running"
+
+
+class _TrueLight:
+    """The box that asks for the simulation's own light, while an estimated one stands in its place.
+
+    Args:
+        gui: whose open folder gets the box.
+        table: draws the light.
+        by: who asks.
+        is_estimated: whether an estimated light is on view.
+    """
+
+    def __init__(self, gui: viser.GuiApi, table: SceneNodes, by: str, is_estimated: Callable[[], bool]) -> None:
+        self._table, self._by, self._is_estimated = table, by, is_estimated
+        self._is_wanted = gui.add_checkbox(
+            "Show true light", False, hint="The simulation's own light, which the estimator does not know."
+        )
+        self._is_wanted.on_update(lambda _: self.draw())
+
+    def draw(self) -> None:
+        """Show the lamp as usual; while an estimated light is on view only on demand, in another colour."""
+        if self._is_estimated():
+            self._table.show_lamp(is_on=self._is_wanted.value, name="true light", by=self._by)
+        else:
+            self._table.show_lamp(is_on=True, by=self._by)
+
+
+class EstimatePanel(Panel):
+    """The nodes of estimates, and a folder to choose which are drawn; the same in all browsers.
+
+    Args:
+        server: whose panel gets the folder.
+        table: whose own light is the true one.
+        nodes: of estimates.
+    """
+
+    def __init__(self, server: viser.ViserServer, table: SceneNodes, nodes: EstimateNodes) -> None:
+        super().__init__("estimate-panel", ESTIMATE_INTERVAL_S)
+        self._nodes = nodes
+        self._job: Job | None = None
+        self._step: EstimateStep | None = None  # not drawn yet
+        self._current: str | None = None
+        self._drawn_job: str | None = None
+        gui = server.gui
+        with gui.add_folder("Estimate", expand_by_default=False):
+            self._wants_tried = gui.add_checkbox("Show candidates", True, hint="Poses and lights that are tried.")
+            self._true_light = _TrueLight(gui, table, estimates.KIND, lambda: not nodes.is_empty)
+            clear = gui.add_button("Clear", hint="Remove what an estimate has drawn.")
+        self._wants_tried.on_update(lambda event: nodes.show_candidates(event.target.value))
+        clear.on_click(lambda _: self.forget())
+
+    def forget(self) -> None:
+        """Remove what a finished estimate has drawn. Any thread may call."""
+        with self._thread.changing():
+            if self._job is None or self._job.is_finished:
+                self._job, self._step = None, None
+
+    def _store(self, event: object) -> bool:
+        match event:
+            case JobView(job, EstimateStep() as step) if job.kind == estimates.KIND and self._is_here(job):
+                self._job, self._step = job, step
+            case JobChanged(_, job) if job.kind == estimates.KIND and self._is_here(job) and takes_view(job, self._job):
+                self._job = job
+            case CurrentScene(record):
+                self._current = None if record is None else record.id
+                if self._job is not None and not self._is_here(self._job):
+                    self._job, self._step = None, None
+            case _:
+                return False
+        return True
+
+    def _is_here(self, job: Job) -> bool:
+        """Check whether it is about what is on view; uploads are shown on any table."""
+        return job.params["of"]["scene"] in (None, self._current)
+
+    def _draw(self) -> None:
+        with self._thread.changed:
+            job, step, self._step = self._job, self._step, None
+        if job is None or job.state in ("cancelled", "failed") or job.id != self._drawn_job:
+            self._nodes.clear()
+            self._drawn_job = None if job is None else job.id
+        if step is not None:
+            self._nodes.show(step.state, step.candidates, step.lights, step.estimate)
+            self._nodes.show_candidates(self._wants_tried.value)
+        self._true_light.draw()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _EpisodeState:
+    """The newest events of an episode, as far as they are drawn; one replaces the older ones of its kind only.
+
+    Attributes:
+        job: that runs the episode.
+        goal: target poses.
+        sight: a step of an estimator at work, or the last estimate.
+        plan: the last round of planning.
+    """
+
+    job: Job | None = None
+    goal: PoseGoal | None = None
+    sight: Looking | EstimatedState | None = None
+    plan: PlanSketch | None = None
+
+    @property
+    def is_live(self) -> bool:
+        """Whether there is more to come."""
+        return self.job is not None and not self.job.is_finished
+
+    def is_on(self, scene: str | None) -> bool:
+        """Check whether it is about a scene."""
+        return self.job is not None and self.job.params["scene"] == scene
+
+    def with_job(self, job: Job) -> _EpisodeState:
+        """Make the state after a change of the job; empty for another job."""
+        if self.job is None or self.job.id != job.id:
+            return _EpisodeState(job)
+        if not job.is_finished:
+            return replace(self, job=job)
+        return replace(self, job=job, plan=None, sight=None if isinstance(self.sight, Looking) else self.sight)
+
+    def with_event(self, event: object) -> _EpisodeState:
+        """Make the state after an event."""
+        match event:
+            case Looking(look="next", step=EstimateStep(candidates=None)):
+                return self  # too short to be seen
+            case Looking():
+                return replace(self, sight=event)
+            case GoalFound(goal):
+                return replace(self, goal=goal)
+            case PlanSketch():
+                return replace(self, plan=event)
+            case Stepped(estimate=estimate):
+                return replace(self, sight=estimate)
+            case _:
+                return self
+
+
+class EpisodePanel(Panel):
+    """The nodes of episodes, and a folder to choose which are drawn; the same in all browsers.
+
+    Args:
+        server: whose panel gets the folder.
+        table: whose own light is the true one.
+        nodes: of episodes.
+        make_room: called before an episode is drawn, to remove what would be in its way.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, table: SceneNodes, nodes: EpisodeNodes, make_room: Callable[[], object]
+    ) -> None:
+        super().__init__("episode-panel", EPISODE_INTERVAL_S)
+        self._nodes = nodes
+        self._make_room = make_room
+        self._state = _EpisodeState()
+        self._current: str | None = None
+        self._drawn = _EpisodeState()
+        self._plan_at = 0.0
+        gui = server.gui
+        with gui.add_folder("Episode", expand_by_default=False):
+            for part, label, hint in _PARTS:
+                gui.add_checkbox(label, True, hint=hint).on_update(partial(self._show_part, part))
+            self._true_light = _TrueLight(gui, table, episodes.KIND, lambda: nodes.shows_light)
+            clear = gui.add_button("Clear", hint="Remove what a finished episode has drawn.")
+        clear.on_click(lambda _: self._forget())
+
+    def _show_part(self, part: Part, event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
+        self._nodes.show_part(part, event.target.value)
+        self._true_light.draw()
+
+    def _forget(self) -> None:
+        with self._thread.changing():
+            if not self._state.is_live:
+                self._state = _EpisodeState()
+
+    def _store(self, event: object) -> bool:
+        state = self._state
+        match event:
+            case JobView(job, view) if job.kind == episodes.KIND:
+                self._state = state.with_job(job).with_event(view)
+            case JobChanged(_, job) if job.kind == episodes.KIND and takes_view(job, state.job):
+                self._state = state.with_job(job)
+            case CurrentScene(record):
+                self._current = None if record is None else record.id
+                if not state.is_live and not state.is_on(self._current):
+                    self._state = _EpisodeState()
+            case DraftChanged(draft) if draft is not None and not state.is_live:
+                self._state = _EpisodeState()  # a new goal begins: the former one would be taken for it
+            case SceneChanged(record) if not state.is_live and state.is_on(record.id):
+                self._state = replace(state, sight=None)  # somebody has moved something: the estimate is outdated
+            case JobView(_, EstimateStep()) if not state.is_live:
+                self._state = replace(state, sight=None)
+            case _:
+                return False
+        return True
+
+    def _draw(self) -> None:
+        with self._thread.changed:
+            state = self._state if self._state.is_on(self._current) else _EpisodeState()
+        if state is not self._drawn:
+            self._draw_changes(state)
+        if state.plan is not None:
+            self._nodes.play(time.monotonic() - self._plan_at)
+            self._thread.wake(EPISODE_INTERVAL_S)
+
+    def _draw_changes(self, state: _EpisodeState) -> None:
+        drawn = self._drawn
+        if _id(state.job) != _id(drawn.job):
+            self._nodes.clear()
+            drawn = _EpisodeState(state.job)
+            if state.is_live:
+                self._make_room()
+        if state.sight is not drawn.sight:
+            match state.sight:
+                case Looking(look=look, step=step):
+                    of_goal = look == "goal"
+                    self._nodes.show_look(step.state, step.candidates, step.lights, step.estimate, of_goal=of_goal)
+                case EstimatedState(state=believed, doubts=doubts):
+                    self._nodes.show_estimate(believed, doubts)
+                case None:
+                    self._nodes.show_estimate(None)
+        if state.goal is not drawn.goal:  # after what was seen while it was looked for
+            goal = state.goal
+            self._nodes.show_goal({} if goal is None else {name: goal.pose(name) for name in goal.names})
+        if state.plan is not drawn.plan:
+            self._nodes.show_plan(state.plan)
+            self._plan_at = time.monotonic()
+        self._true_light.draw()
+        self._drawn = state
+
+
+def _id(job: Job | None) -> str | None:
+    return None if job is None else job.id

@@ -1,1 +1,0 @@
-"""Panels of the viewer: GUI folders, and the threads that keep their nodes up to date."""

@@ -1,0 +1,516 @@
+"""Predicted pushes in the 3D view: the folder in the panel, and the thread that draws them and compares with the truth.
+
+What comes from browsers, the simulation and the process that predicts is only stored; drawing happens in the thread.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from functools import partial
+from html import escape
+
+import numpy as np
+import viser
+from jaxtyping import Float
+
+from app.processes.messages.neural_messages import NeuralAnswer, Predicted
+from app.processes.messages.scene_messages import SceneChanged, SceneRecord
+from app.services.event_hub import CurrentScene
+from app.services.predictions import Predictions
+from app.services.pushes import MAX_ACTIONS, Outcome, along, outcomes, straight, toward_nearest, way
+from app.viewer.drawing import DrawingThread, Panel, RunCommand, status
+from app.viewer.nodes.push_nodes import FEWEST, MOST, PushNodes, Waypoints
+from app.viewer.nodes.scene_nodes import Client
+from osfcore.errors import OsfError
+from osfcore.geometry.rollouts import Rollouts
+from osfcore.geometry.states import SceneState
+from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S
+from osfcore.objects.asset_library import AssetLibrary
+
+TICK_S = 0.03  # between two pictures of a moving ghost
+_KEY = "viewer"
+_INTRO = "Starts from the **true poses** in the simulator."
+_IDLE = "Choose a push, then Predict"
+_EXECUTING, _EXECUTED = "Executing", "Executed. Purple: predicted; black: the true ways"
+_CHANGED = "The table has changed; predict again"
+Act = Callable[[str, list[np.ndarray]], SceneRecord]
+
+
+class CannotExecute(OsfError):
+    """Actions that may not be executed now."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Request:
+    """A requested prediction and, once it is there, its answer."""
+
+    record: SceneRecord
+    actions: Float[np.ndarray, "T 3"]
+    client: Client
+    answer: Future[NeuralAnswer]
+
+
+class PushPanel(Panel):
+    """The folder and the nodes of predicted pushes; the same in all browsers.
+
+    Args:
+        server: whose panel gets the folder.
+        library: meshes, symmetries and labels of the objects.
+        predictions: predicts pushes.
+        act: executes actions in a scene and returns the scene afterwards.
+        run_command: carries out a command and notifies its client if it is refused.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        library: AssetLibrary,
+        predictions: Predictions,
+        act: Act,
+        run_command: RunCommand,
+    ) -> None:
+        super().__init__("push-panel", TICK_S)
+        self._library = library
+        self._predictions = predictions
+        self._act = act
+        self._run_command = run_command
+        self._nodes = PushNodes(server, library)
+        self._record: SceneRecord | None = None
+        self._prediction: PushPrediction | None = None
+        self._drawn: PushPrediction | None = None
+        self._answered: _Request | None = None
+        self._message = _IDLE
+        self._executing: PushPrediction | None = None
+        self._has_plan = False  # whether anybody has begun to choose a push
+        gui = server.gui
+        with gui.add_folder("What will a push do?", expand_by_default=False):
+            gui.add_markdown(_INTRO)
+            self._controls = PushControls(server, self._replan)
+            predict = gui.add_button("Predict", color="violet")
+            self._execute_button = gui.add_button(
+                "Execute", disabled=True, hint="Carry out these very actions in the simulator, and compare."
+            )
+            self._status = gui.add_html(status("push", _IDLE))
+            self._report = gui.add_html("", visible=False)
+            self._player = PushPlayer(gui, self._thread)
+            clear = gui.add_button("Clear", hint="Remove what is drawn of a push.")
+        predict.on_click(lambda event: self._run_command(partial(self._predict, event.client), event.client))
+        self._execute_button.on_click(lambda event: self._run_command(self._execute, event.client))
+        clear.on_click(lambda _: self._forget())
+
+    def _store(self, event: object) -> bool:
+        match event:
+            case CurrentScene(record):
+                self._record, self._prediction, self._message = record, None, _IDLE
+            case SceneChanged(record, states) if self._record is not None and record.id == self._record.id:
+                self._record = record
+                if self._prediction is not None:
+                    self._prediction = self._prediction.after(record, states, self._executing)
+                    self._message = _CHANGED if self._prediction is None else self._message
+            case _:
+                return False
+        return True
+
+    def _replan(self) -> None:
+        """Another push is chosen: what was predicted, or executed, is about a former one."""
+        with self._thread.changing():
+            self._has_plan = True
+            if self._executing is None:
+                self._prediction, self._message = None, _IDLE
+
+    def _forget(self) -> None:
+        with self._thread.changing():
+            self._prediction, self._message, self._has_plan = None, _IDLE, False
+
+    def _say(self, text: str) -> None:
+        with self._thread.changing():
+            self._message = self._library.in_words(text)
+
+    # Predicting and executing; called in viser's pool
+
+    def _predict(self, client: Client) -> None:
+        try:
+            record = self._predictions.current()
+            actions = self._controls.actions(record.state)
+            is_warm = self._predictions.is_warm
+            answer = self._predictions.submit(record.state, actions[None], _KEY)
+        except OsfError as error:
+            self._say(str(error))
+            raise
+        with self._thread.changing():
+            self._has_plan = True
+            self._message = "Predicting" if is_warm else "Loading the network, some seconds the first time"
+        request = _Request(record, actions, client, answer)
+        answer.add_done_callback(lambda _: self._note_answer(request))
+
+    def _note_answer(self, request: _Request) -> None:
+        with self._thread.changing():
+            self._answered = request
+
+    def _execute(self) -> None:
+        with self._thread.changing():
+            prediction = self._prediction
+            if prediction is None or prediction.is_executed or self._executing is not None:
+                raise CannotExecute("There is no new prediction to execute; press Predict first.")
+            self._executing, self._message = prediction, _EXECUTING
+        message = ""
+        try:
+            done = self._act(prediction.record.id, list(prediction.actions))
+            message = _EXECUTED if done.revision == prediction.last_revision else _CHANGED
+        except OsfError as error:
+            message = self._library.in_words(str(error))
+            raise
+        finally:
+            with self._thread.changing():
+                self._executing = None
+                self._message = message or "Not executed; the log tells more"
+                if message == _CHANGED:
+                    self._prediction = None
+
+    # The thread
+
+    def _draw(self) -> None:
+        with self._thread.changed:
+            answered, self._answered = self._answered, None
+        if answered is not None:
+            self._take(answered)
+        with self._thread.changed:
+            record, prediction, message = self._record, self._prediction, self._message
+        is_executed = prediction is not None and prediction.is_executed
+        self._draw_plan(record, is_executed=is_executed)
+        if prediction is not self._drawn:
+            if prediction is None:
+                self._report.visible = False
+                self._player.close()
+                self._nodes.clear()
+            else:
+                message = self._draw_prediction(prediction)
+            self._drawn = prediction
+        if prediction is not None:
+            self._nodes.at(self._player.advance() / STEP_S)
+        if self._status.content != status("push", message):
+            self._status.content = status("push", message)
+        is_idle = prediction is None or is_executed or self._executing is not None
+        if self._execute_button.disabled != is_idle:
+            self._execute_button.disabled = is_idle
+
+    def _take(self, request: _Request) -> None:
+        """Make an answer what is on view, unless the table has changed meanwhile."""
+        error = request.answer.exception()
+        answer = None if error else request.answer.result()
+        if isinstance(error, OsfError):
+
+            def refuse(error: OsfError = error) -> None:
+                raise error
+
+            self._say(str(error))
+            self._run_command(refuse, request.client)
+        elif error is not None:
+            self._say("The prediction failed; the log tells more")
+            raise error
+        with self._thread.changed:
+            now = self._record
+            if not isinstance(answer, Predicted):  # overtaken by a newer request
+                return
+            if now is None or (now.id, now.revision) != (request.record.id, request.record.revision):
+                self._message = _CHANGED
+                return
+            self._prediction = PushPrediction(request.record, request.actions, answer.rollouts, answer.took_s)
+
+    def _draw_plan(self, record: SceneRecord | None, *, is_executed: bool) -> None:
+        path = None
+        if record is not None:
+            self._controls.follow(record, is_chosen=self._has_plan)
+            path = self._controls.path(record.state) if self._has_plan else None
+        self._controls.show_waypoints(path is not None)
+        self._nodes.plan(None if is_executed else path)  # once executed, the plan would only lead on from there
+
+    def _draw_prediction(self, prediction: PushPrediction) -> str:
+        """Draw a prediction, or what came of it; returns the status message."""
+        drawn = self._drawn
+        if drawn is None or drawn.rollouts is not prediction.rollouts:
+            self._nodes.show(prediction.rollouts)
+            self._player.open(len(prediction.actions) * STEP_S)
+        if prediction.truth:
+            self._nodes.show_truth(prediction.truth)
+            message = _EXECUTED if prediction.is_executed else _EXECUTING
+        else:
+            moving = len(self._nodes.moving)
+            text = f"{moving} object{'s' * (moving != 1)} will move" if moving else "Nothing will move"
+            message = f"{text}; predicted in {1000 * prediction.took_s:.0f} ms"
+        after = prediction.truth[-1] if prediction.is_executed else None
+        rows = outcomes(prediction.record.state, prediction.rollouts, after, self._library)
+        self._report.content = report(rows, {name: self._library.label(name) for name in prediction.rollouts.names})
+        self._report.visible = True
+        with self._thread.changed:
+            if self._prediction is prediction:  # else the next drawing says what is newer, with its nodes
+                self._message = message
+        return message
+
+
+# Choosing a push: straight ahead, or along waypoints that are dragged over the table
+
+STRAIGHT, PATH = "Straight", "Waypoints"
+COMPASS = {"→": 0, "↗": 45, "↑": 90, "↖": 135, "←": 180, "↙": 225, "↓": 270, "↘": 315}
+_SPEED = (0.05, MAX_SPEED_M_S)
+_DEFAULT_STEPS = 6
+_FURTHER_M = 0.05
+
+
+class PushControls:
+    """Elements for the kind of push, its heading, speed and length, and the waypoints.
+
+    Args:
+        server: whose open folder gets the elements, and whose scene gets the waypoints.
+        on_change: called when somebody has chosen another push; must be quick.
+    """
+
+    def __init__(self, server: viser.ViserServer, on_change: Callable[[], None]) -> None:
+        gui = server.gui
+        self._on_change = on_change
+        self._waypoints = Waypoints(server, on_change)
+        self._laid_for: tuple[str, tuple[float, ...]] = "", ()  # scene and pusher position
+        self._kind = gui.add_dropdown("Push", (STRAIGHT, PATH), hint="Straight ahead, or along handles to drag.")
+        self._compass = gui.add_button_group("Direction", tuple(COMPASS), hint="As seen from above, +y up.")
+        self._heading = gui.add_slider("Heading, °", 0, 355, 5, 0, hint="From +x toward +y.")
+        self._speed = gui.add_slider("Speed, m/s", *_SPEED, 0.01, 0.25)
+        self._steps = gui.add_slider("Steps", 1, MAX_ACTIONS, 1, _DEFAULT_STEPS, hint=f"Of {STEP_S} s each.")
+        self._count = gui.add_slider("Waypoints", FEWEST, MOST, 1, 3, visible=False)
+        for control in (self._heading, self._speed, self._steps, self._count):
+            control.on_update(lambda event: None if event.client is None else on_change())
+        self._kind.on_update(lambda _: self._choose_kind())
+        self._compass.on_click(lambda event: self._turn(event.target.value))
+
+    def actions(self, state: SceneState) -> Float[np.ndarray, "T 3"]:
+        """The chosen actions [m/s] from a state; values from browsers are clipped to the sliders' ranges.
+
+        Raises:
+            InvalidInput: if a path is empty or takes too many actions.
+        """
+        start = np.zeros(2) if state.pusher is None else state.pusher[:2]
+        speed_m_s = number_between(self._speed.value, *_SPEED)
+        if self._is_path:
+            return along(start, self._waypoints.places(self._waypoint_count), speed_m_s)
+        heading_rad = math.radians(number_between(self._heading.value, 0.0, 360.0))
+        return straight(heading_rad, speed_m_s, int(number_between(self._steps.value, 1, MAX_ACTIONS)))
+
+    def path(self, state: SceneState) -> Float[np.ndarray, "P 2"] | None:
+        """The chosen way of the pusher on the table [m], its start included; None without a pusher."""
+        if state.pusher is None:
+            return None
+        if self._is_path:  # straight through the handles, even where that takes too many actions
+            return np.concatenate([state.pusher[None, :2], self._waypoints.places(self._waypoint_count)])
+        return way(state.pusher[:2], self.actions(state))
+
+    def follow(self, record: SceneRecord, *, is_chosen: bool) -> None:
+        """Lay the waypoints out anew when the pusher has moved, and propose a push unless one was chosen here."""
+        if record.state.pusher is None:
+            return
+        pusher = record.state.pusher[:2]
+        laid_for = (record.id, tuple(pusher))
+        if laid_for != self._laid_for:
+            if self._laid_for[0] != record.id or not is_chosen:
+                self._aim(record.state)
+            self._waypoints.lay(pusher, toward_nearest(record.state)[0])
+            self._laid_for = laid_for
+
+    def show_waypoints(self, is_on: bool) -> None:
+        """Show the handles, if the push is a path, or hide them."""
+        self._waypoints.show(self._waypoint_count if is_on and self._is_path else 0)
+
+    @property
+    def _is_path(self) -> bool:
+        return self._kind.value == PATH
+
+    @property
+    def _waypoint_count(self) -> int:
+        return int(number_between(self._count.value, FEWEST, MOST))
+
+    def _choose_kind(self) -> None:
+        is_path = self._is_path
+        for control in (self._compass, self._heading, self._steps):
+            control.visible = not is_path
+        self._count.visible = is_path
+        self._on_change()
+
+    def _turn(self, arrow: str) -> None:
+        if arrow in COMPASS:  # clients may send anything
+            self._heading.value = COMPASS[arrow]
+            self._on_change()
+
+    def _aim(self, state: SceneState) -> None:
+        """Propose a push that reaches the nearest object and goes on for a few centimetres."""
+        heading_rad, distance_m = toward_nearest(state)
+        self._heading.value = int(5 * round(math.degrees(heading_rad) / 5)) % 360
+        step_m = STEP_S * number_between(self._speed.value, *_SPEED)
+        self._steps.value = min(max(math.ceil((distance_m + _FURTHER_M) / step_m - 1e-9), 1), MAX_ACTIONS)
+
+
+def number_between(value: object, low: float, high: float) -> float:
+    """A number that a browser sent, clipped to [low, high].
+
+    Args:
+        value: which may be anything.
+        low: of the range, and the result for what is not a finite number.
+        high: of the range.
+    """
+    try:
+        number = float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError, OverflowError):
+        return low
+    return min(max(number, low), high) if math.isfinite(number) else low
+
+
+class PushPlayer:
+    """Which moment of a prediction is on view. Hidden until there is a prediction.
+
+    Args:
+        gui: whose open folder gets the two elements.
+        thread: draws the moment; it guards what is stored here.
+    """
+
+    def __init__(self, gui: viser.GuiApi, thread: DrawingThread) -> None:
+        self._thread = thread
+        self._end_s: float | None = None
+        self._shown_s = 0.0
+        self._playing_since: float | None = None
+        self._slider = gui.add_slider("Time, s", 0.0, 1.0, 0.05, 0.0, visible=False)
+        self._button = gui.add_button("Play", visible=False)
+        self._slider.on_update(self._seek)
+        self._button.on_click(lambda _: self._toggle())
+
+    def open(self, end_s: float) -> None:
+        """Show the end of another prediction, which lasts so long [s]."""
+        with self._thread.changed:
+            self._end_s = self._shown_s = end_s
+            self._playing_since = None
+        self._slider.max = end_s
+        self._slider.visible = self._button.visible = True
+
+    def close(self) -> None:
+        """Hide the elements."""
+        with self._thread.changed:
+            self._end_s = self._playing_since = None
+        self._slider.visible = self._button.visible = False
+
+    def advance(self) -> float:
+        """Update the elements and wake the thread again while playing; returns the moment to draw [s]."""
+        with self._thread.changed:
+            if self._playing_since is not None and self._end_s is not None:
+                self._shown_s = min(time.monotonic() - self._playing_since, self._end_s)
+                if self._shown_s >= self._end_s:
+                    self._playing_since = None
+            shown_s, is_playing = self._shown_s, self._playing_since is not None
+            if is_playing:
+                self._thread.wake(TICK_S)
+        label = "Pause" if is_playing else "Play"
+        if self._button.label != label:
+            self._button.label = label
+        if abs(float(self._slider.value) - shown_s) > 1e-6:
+            self._slider.value = shown_s
+        return shown_s
+
+    def _seek(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+        if event.client is not None:  # else set by `advance`
+            with self._thread.changing():
+                self._shown_s = number_between(event.target.value, 0.0, MAX_ACTIONS * STEP_S)
+                self._playing_since = None
+
+    def _toggle(self) -> None:
+        with self._thread.changing():
+            if self._end_s is None or self._playing_since is not None:
+                self._playing_since = None
+            else:
+                begin_s = 0.0 if self._shown_s >= self._end_s - 1e-6 else self._shown_s
+                self._playing_since = time.monotonic() - begin_s
+
+
+# A prediction, what came of it, and its table
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PushPrediction:
+    """A push that was predicted, and perhaps executed.
+
+    Attributes:
+        record: the scene from which it starts.
+        actions: that are tried.
+        rollouts: what they were predicted to lead to.
+        took_s: time that predicting took [s].
+        truth: the way things truly went, as far as it has been executed; empty before.
+        is_executed: whether exactly these actions, all of them, were executed.
+    """
+
+    record: SceneRecord
+    actions: Float[np.ndarray, "T 3"]
+    rollouts: Rollouts
+    took_s: float
+    truth: tuple[SceneState, ...] = ()
+    is_executed: bool = False
+
+    @property
+    def last_revision(self) -> int:
+        """Of the scene once it has been executed: the simulation counts actions."""
+        return self.record.revision + len(self.actions)
+
+    def after(
+        self, record: SceneRecord, states: tuple[SceneState, ...], executing: PushPrediction | None
+    ) -> PushPrediction | None:
+        """What is left of it after a change: it outlives the execution of its own actions, and nothing else.
+
+        Args:
+            record: the scene after the change.
+            states: the way there.
+            executing: whose actions are being executed now.
+        """
+        if record.revision <= self.record.revision:
+            return self
+        is_own = executing is not None and executing.rollouts is self.rollouts
+        if is_own and record.revision <= self.last_revision:
+            truth = (*(self.truth or (self.record.state,)), *states, record.state)
+            return replace(self, truth=truth, is_executed=record.revision == self.last_revision)
+        return self if self.is_executed and record.revision == self.last_revision else None
+
+
+_STYLE = "width:100%;border-collapse:collapse;font-size:0.7em;line-height:1.35"
+_HEAD = "text-align:right;padding-left:0.5em;font-weight:600;vertical-align:bottom"
+_CELL = "text-align:right;padding-left:0.5em;vertical-align:top;white-space:nowrap"
+
+
+def report(outcomes: Iterable[Outcome], labels: Mapping[str, str]) -> str:
+    """HTML of a table with a line for each object; labels, which users choose, are escaped."""
+    rows = tuple(outcomes)
+    if not rows:
+        return ""
+    is_tried = rows[0].off_mm is not None
+    heads = ("Predicted", "True", "Off by") if is_tried else ("Predicted to go",)
+    head = "".join(f'<th style="{_HEAD}">{text}</th>' for text in heads)
+    lines = "".join(_line(row, labels.get(row.name, row.name)) for row in rows)
+    return (
+        f'<div style="padding:0 0.7em 0.4em"><table class="push-report" style="{_STYLE}">'
+        f'<tr><th style="text-align:left">Object</th>{head}</tr>{lines}</table></div>'
+    )
+
+
+def _line(row: Outcome, label: str) -> str:
+    cells = [_motion(row.predicted_mm, row.predicted_deg)]
+    if row.went_mm is not None and row.turned_deg is not None:
+        cells.append(_motion(row.went_mm, row.turned_deg))
+    if row.off_mm is not None and row.off_deg is not None:
+        cells.append(f"<b>{_motion(row.off_mm, row.off_deg)}</b>")
+    data = "".join(f'<td style="{_CELL}">{cell}</td>' for cell in cells)
+    return f'<tr data-object="{escape(row.name)}"><td>{escape(label)}</td>{data}</tr>'
+
+
+def _motion(shift_mm: float, turn_deg: float) -> str:
+    if shift_mm < 0.05 and turn_deg < 0.05:
+        return "still"
+    return f"{_digits(shift_mm)} mm<br>{_digits(turn_deg)}°"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
