@@ -6,11 +6,11 @@ The facts are the records themselves, as dataclasses that the JSON codec reads a
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import shutil
 import tempfile
 import threading
-import uuid
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from PIL import Image
 from pydantic import ConfigDict, Field, GetPydanticSchema
 from pydantic_core import core_schema
 
@@ -28,18 +29,19 @@ from app.storage.photos import PhotoCrop
 from osfcore.errors import CannotWrite, CorruptFile, NotThere, OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, unit_quaternion
-from osfcore.io.files import folder_at_once, put_in_place, read_json
+from osfcore.io.files import folder_at_once, is_file_name, put_in_place, read_json, reading_png, remove_folder
 from osfcore.io.json_codec import Entry, Matrix3, Text, Vector3, Vector4, decode, encode
 from osfcore.io.scene_file import CameraJson, ObjectJson
 
 Poses = tuple[tuple[str, Pose], ...]
 Files = Mapping[str, bytes | None]  # of a record by name; None for one that is not there
 _NO_FILES: Files = MappingProxyType({})
-_TEMPORARY_PREFIX = ".new-"
 
 
-class Dated(Protocol):
-    """What every record has."""
+class Kept(Protocol):
+    """What every record has; they are dataclasses."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def id(self) -> str:
@@ -51,8 +53,26 @@ class Dated(Protocol):
         """UTC, ISO 8601."""
         ...
 
+    @property
+    def number(self) -> int:
+        """Orders the records, whatever the clock says; 0 for those of earlier versions."""
+        ...
 
-Record = TypeVar("Record", bound=Dated)
+
+Record = TypeVar("Record", bound=Kept)
+
+
+@dataclass(frozen=True, slots=True)
+class Damaged:
+    """A record that can be deleted, and used for nothing else.
+
+    Attributes:
+        id: name of its folder.
+        reason: what is wrong with it.
+    """
+
+    id: str
+    reason: str
 
 
 class RecordFolders(Generic[Record]):
@@ -62,17 +82,19 @@ class RecordFolders(Generic[Record]):
         root: the folder; made when the first record comes.
         kind: of the records, a dataclass that the JSON codec takes.
         what: a record is, in sentences; "goal" for records whose facts are in `goal.json`.
+        picture: the file without which a record is damaged, a PNG or JPEG.
         most: records kept at once.
         too_many: the error that says so.
     """
 
     def __init__(
-        self, root: Path, kind: type[Record], what: str, most: int, too_many: Callable[[int], OsfError]
+        self, root: Path, kind: type[Record], what: str, picture: str, most: int, too_many: Callable[[int], OsfError]
     ) -> None:
-        self._root, self._kind, self._what = root, kind, what
+        self._root, self._kind, self._what, self._picture = root, kind, what, picture
         self._most, self._too_many = most, too_many
         self._facts = f"{what}.json"
         self._lock = threading.RLock()
+        self._known: dict[Path, tuple[object, Record | Damaged]] = {}  # with what the files were when they were read
 
     def start(self) -> None:
         """Remove what an earlier service left half done."""
@@ -80,51 +102,50 @@ class RecordFolders(Generic[Record]):
             shutil.rmtree(folder, ignore_errors=True)
 
     def all(self) -> tuple[Record, ...]:
-        """Return all records, newest first."""
-        records = []
-        for path in self._root.glob(f"[!.]*/{self._facts}"):
-            with contextlib.suppress(CorruptFile, OSError):  # a damaged one must not hide the others
-                records.append(self._read(path))
-        return tuple(sorted(records, key=lambda record: (record.created_at, record.id), reverse=True))
+        """Return the records that can be used, newest first."""
+        return tuple(record for record in self._found() if not isinstance(record, Damaged))
+
+    def damaged(self) -> tuple[Damaged, ...]:
+        """Return the records that cannot be used."""
+        return tuple(record for record in self._found() if isinstance(record, Damaged))
 
     def get(self, name: str) -> Record:
         """Return one record.
 
         Raises:
             UnknownName: if there is none.
+            CorruptFile: if it is damaged.
         """
-        for record in self.all():
-            if record.id == name:
-                return record
-        raise NotThere(self._what)
+        record = self._read(self._folder(name))
+        if isinstance(record, Damaged):
+            raise CorruptFile(f"This {self._what}", f"{record.reason}; delete it")
+        return record
 
     def remove(self, name: str) -> None:
-        """Delete a record.
+        """Delete a record, damaged or not.
 
         Raises:
             UnknownName: if there is none.
             CannotStore: if that is not allowed.
         """
-        trash = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
         with self._lock, self._stored():
-            self.get(name)
-            (self._root / name).rename(trash)
-        shutil.rmtree(trash, ignore_errors=True)
+            remove_folder(self._folder(name))
 
     def _keep(self, record: Record, files: Files) -> None:
         """Put a new record in place, whole or not at all."""
         with self._lock, self._stored():  # others may come in at the same time
-            if len(self.all()) >= self._most:
+            found = self._found()
+            if len(found) >= self._most:
                 raise self._too_many(self._most)
+            latest = max((each.number for each in found if not isinstance(each, Damaged)), default=0)
             with folder_at_once(self._root / record.id) as folder:
-                self._write(folder, record, files)
+                self._write(folder, replace(record, number=latest + 1), files)
 
     def _replace(self, record: Record, files: Files) -> None:
         """Give a record that exists other files and facts, the facts last; files that are None are removed."""
-        place = self._root / record.id
         with self._lock, self._stored():
-            self.get(record.id)
-            with tempfile.TemporaryDirectory(prefix=_TEMPORARY_PREFIX, dir=self._root) as folder:
+            place = self._folder(record.id)
+            with tempfile.TemporaryDirectory(prefix=".", dir=self._root) as folder:
                 self._write(Path(folder), record, files)  # all of it before anything changes
                 for file in (*files, self._facts):
                     if files.get(file, b"") is None:
@@ -138,10 +159,45 @@ class RecordFolders(Generic[Record]):
                 (folder / name).write_bytes(data)
         (folder / self._facts).write_bytes((json.dumps(encode(record), indent=1) + "\n").encode())
 
-    def _read(self, path: Path) -> Record:
-        record = read_json(path, lambda data: decode(self._kind, data, self._what))
-        if record.id != path.parent.name:
-            raise CorruptFile(path, f"its id is {shown(record.id)}, not the name of its folder")
+    def _folder(self, name: str) -> Path:
+        is_plain = is_file_name(name) and Path(name).name == name and not name.startswith(".")
+        if not is_plain or not (self._root / name).is_dir():
+            raise NotThere(self._what)
+        return self._root / name
+
+    def _found(self) -> list[Record | Damaged]:
+        """Return all records, newest first, and then those that are damaged."""
+        sound: list[Record] = []
+        damaged: list[Record | Damaged] = []
+        folders = sorted(folder for folder in self._root.glob("[!.]*") if folder.is_dir())
+        for folder in folders:
+            with contextlib.suppress(NotThere):  # another caller has just deleted it
+                record = self._read(folder)
+                damaged.append(record) if isinstance(record, Damaged) else sound.append(record)
+        self._known = {folder: known for folder, known in self._known.items() if folder in folders}
+        return sorted(sound, key=lambda record: (record.number, record.created_at, record.id), reverse=True) + damaged
+
+    def _read(self, folder: Path) -> Record | Damaged:
+        """Return what is in a folder, which is read again when its files are other ones.
+
+        Raises:
+            UnknownName: if it is not there any more.
+        """
+        facts, picture = folder / self._facts, folder / self._picture
+        stamps = tuple(_stamp(path) for path in (folder, facts, picture))
+        before, record = self._known.get(folder, (None, None))
+        if record is not None and before == stamps:
+            return record
+        try:
+            record = read_json(facts, lambda data: decode(self._kind, data, self._what))
+            if record.id != folder.name:
+                raise CorruptFile(facts, "it is that of another one")
+            _check_picture(picture)
+        except CorruptFile as error:
+            if not folder.is_dir():
+                raise NotThere(self._what) from None
+            record = Damaged(folder.name, f"{Path(error.path).name}: {error.reason}")
+        self._known[folder] = stamps, record
         return record
 
     @contextlib.contextmanager
@@ -153,6 +209,29 @@ class RecordFolders(Generic[Record]):
             raise CannotStore(Path(self._root.name), error.reason) from error
         except OSError as error:
             raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return what changes when a file or folder does; None if there is none."""
+    try:
+        state = path.stat()
+    except OSError:
+        return None
+    return state.st_ino, state.st_size, state.st_mtime_ns
+
+
+def _check_picture(path: Path) -> None:
+    """Refuse a PNG of which the checksums, or a JPEG of which the end is missing.
+
+    Raises:
+        CorruptFile: if so, or if it is neither.
+    """
+    with reading_png(path, "it is not whole"):
+        data = path.read_bytes()
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+            image.verify()
+        if image.format == "JPEG" and not data.endswith(b"\xff\xd9"):
+            raise CorruptFile(path, "it is not whole")
 
 
 # How values of the core stand in the facts
@@ -242,6 +321,7 @@ class GoalRecord:
         poses: of the objects in it, where they are known; "objects" in the file.
         example: that it belongs to; None if it is anybody's own.
         photo: that it was cut out of; None if it was made here, or by an earlier version.
+        number: orders the goals; the store gives it.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(serialize_by_alias=True)
@@ -255,6 +335,7 @@ class GoalRecord:
     poses: Annotated[_PosesFact | None, Field(alias="objects")]
     example: Text | None = None
     photo: PhotoRecord | None = None
+    number: int = 0
 
 
 class GoalStore(RecordFolders[GoalRecord]):
@@ -266,7 +347,7 @@ class GoalStore(RecordFolders[GoalRecord]):
     """
 
     def __init__(self, root: Path, max_goals: int) -> None:
-        super().__init__(root, GoalRecord, "goal", max_goals, TooManyGoals)
+        super().__init__(root, GoalRecord, "goal", IMAGE, max_goals, TooManyGoals)
 
     def image(self, goal: str) -> Path:
         """Return where the image of a goal that exists is."""
@@ -348,6 +429,7 @@ class TablePhoto:
         job: the estimate of what is marked now; None if there is none.
         scene: the table that it became; None if it did not.
         T_table_photo: where the photograph's table frame lies on that table.
+        number: orders the photographs; the store gives it.
     """
 
     id: Text
@@ -364,6 +446,7 @@ class TablePhoto:
     job: Text | None = None
     scene: Text | None = None
     T_table_photo: _PoseFact | None = None
+    number: int = 0
 
     def marked(self, name: str) -> MarkedObject:
         """Return one of the marked objects.
@@ -406,7 +489,7 @@ class TablePhotoStore(RecordFolders[TablePhoto]):
     """
 
     def __init__(self, root: Path, max_photos: int) -> None:
-        super().__init__(root, TablePhoto, "photo", max_photos, TooManyPhotos)
+        super().__init__(root, TablePhoto, "photo", PICTURE, max_photos, TooManyPhotos)
 
     def picture(self, photo: str) -> Path:
         """Return where what is shown is of a photograph that exists."""

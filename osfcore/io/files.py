@@ -193,6 +193,18 @@ def replace_folder(made: Path, place: Path) -> None:
     sync(place.parent)
 
 
+def remove_folder(folder: Path) -> None:
+    """Delete a folder in one piece; on return it is gone for good, also after a power failure.
+
+    Raises:
+        OSError: if the disk refuses; then it is in place, or not for certain.
+    """
+    aside = _beside(folder)
+    folder.rename(aside)
+    sync(folder.parent)
+    shutil.rmtree(aside, ignore_errors=True)
+
+
 def _make_folder(folder: Path, wanted: Path) -> None:
     """Make a folder, and those around it, for what is wanted."""
     if not folder.is_dir():

@@ -26,7 +26,7 @@ from app.api.schemas.goals import (
     GoalPatch,
 )
 from app.api.schemas.limits import CAMERA_JSON, GOAL_NAME, NAME, sized
-from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
+from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, page
 from app.services.goals.goals import Draft, NoDraft
 from app.storage.records import GoalRecord
 from osfcore.errors import InvalidInput, OsfError
@@ -49,7 +49,10 @@ _BODY = {
 router = APIRouter(prefix=UPLOAD_PATH, tags=["goals"], responses=problems(), route_class=BoundedRoute)
 
 
-def _known_goal(services: ServicesDep, goal: Annotated[str, Path(description="Identifier of a goal.")]) -> GoalRecord:
+GoalPath = Annotated[str, Path(description="Identifier of a goal.")]
+
+
+def _known_goal(services: ServicesDep, goal: GoalPath) -> GoalRecord:
     with named_in_path():
         return services.goals.get(goal)
 
@@ -97,7 +100,8 @@ async def create(
 def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> GoalList:
     """List goals, newest first."""
     shown, total, following = page(services.goals.all(), limit, after, newest_first=True)
-    return GoalList(goals=[GoalOut.of(record) for record in shown], total=total, next=following)
+    damaged = [DamagedOut(id=each.id, reason=each.reason) for each in services.goals.damaged()]
+    return GoalList(goals=[GoalOut.of(record) for record in shown], damaged=damaged, total=total, next=following)
 
 
 @router.post("/draft", status_code=status.HTTP_201_CREATED, responses=problems(409, 503))
@@ -145,7 +149,7 @@ def save(services: ServicesDep, body: DraftKeep, response: Response) -> GoalOut:
     return GoalOut.of(record)
 
 
-@router.get("/{goal}", responses=problems(404))
+@router.get("/{goal}", responses=problems(404, 409))
 def get(record: FoundDep) -> GoalOut:
     """Tell about a goal."""
     return GoalOut.of(record)
@@ -169,14 +173,14 @@ def check(
     return GoalCheckOut.of(services.goal_checks.check(record.id, scene))
 
 
-@router.get("/{goal}/photo.jpg", response_class=FileResponse, responses={**problems(404), **JPEG})
+@router.get("/{goal}/photo.jpg", response_class=FileResponse, responses={**problems(404, 409), **JPEG})
 def photo(services: ServicesDep, record: FoundDep) -> OpenFile:
     """Show the whole photo that a goal was cut out of, no side longer than 2048 px."""
     gone = f"{record.name} was not cut out of a photo."
     return OpenFile(services.goals.photo(record.id), gone, media_type="image/jpeg")
 
 
-@router.get("/{goal}/image.png", response_class=FileResponse, responses={**problems(404), **PNG})
+@router.get("/{goal}/image.png", response_class=FileResponse, responses={**problems(404, 409), **PNG})
 def image(services: ServicesDep, record: FoundDep) -> OpenFile:
     """Show a goal."""
     path = services.goals.image(record.id)
@@ -185,9 +189,10 @@ def image(services: ServicesDep, record: FoundDep) -> OpenFile:
 
 
 @router.delete("/{goal}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 507))
-def remove(services: ServicesDep, record: FoundDep) -> None:
-    """Delete a goal; episodes that had it keep their own copy."""
-    services.goals.remove(record.id)
+def remove(services: ServicesDep, goal: GoalPath) -> None:
+    """Delete a goal, damaged or not; episodes that had it keep their own copy."""
+    with named_in_path():
+        services.goals.remove(goal)
 
 
 def _made(services: Services, body: GoalIn) -> GoalRecord:

@@ -15,7 +15,7 @@ from app.api.problems import named_in_path
 from app.api.routes import JPEG, PNG, problems
 from app.api.schemas.goals import GoalOut
 from app.api.schemas.limits import FOCAL, GOAL_NAME, NAME, sized, within
-from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, Limit, page
+from app.api.schemas.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, page
 from app.api.schemas.photos import (
     ChoiceIn,
     FindIn,
@@ -46,9 +46,10 @@ router = APIRouter(prefix=UPLOAD_PATH, tags=["photos"], responses=problems(), ro
 ObjectPath = Annotated[str, Path(**sized(NAME), description="Name of an object.", examples=["025_mug"])]
 
 
-def _known_photo(
-    services: ServicesDep, photo: Annotated[str, Path(description="Identifier of a photo.")]
-) -> TablePhoto:
+PhotoPath = Annotated[str, Path(description="Identifier of a photo.")]
+
+
+def _known_photo(services: ServicesDep, photo: PhotoPath) -> TablePhoto:
     with named_in_path():
         return services.photos.get(photo)
 
@@ -92,7 +93,8 @@ async def create(
 def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> PhotoList:
     """List photos of tables, newest first."""
     shown, total, following = page(services.photos.all(), limit, after, newest_first=True)
-    return PhotoList(photos=[facts_of(photo) for photo in shown], total=total, next=following)
+    damaged = [DamagedOut(id=each.id, reason=each.reason) for each in services.photos.damaged()]
+    return PhotoList(photos=[facts_of(photo) for photo in shown], damaged=damaged, total=total, next=following)
 
 
 @router.get("/board.pdf", response_class=Response, responses={200: {"content": {"application/pdf": {}}}})
@@ -101,13 +103,13 @@ def board() -> Response:
     return Response(board_pdf(Board()), media_type="application/pdf")
 
 
-@router.get("/{photo}", responses=problems(404))
+@router.get("/{photo}", responses=problems(404, 409))
 def get(services: ServicesDep, photo: PhotoDep) -> TablePhotoOut:
     """Tell what is marked in a photo, and what was found."""
     return _out(services, photo)
 
 
-@router.patch("/{photo}", responses=problems(404, 503, 507))
+@router.patch("/{photo}", responses=problems(404, 409, 503, 507))
 @slow
 def set_camera(services: ServicesDep, photo: PhotoDep, body: PhotoPatch) -> TablePhotoOut:
     """Give a photo another focal length, or the calibrated camera that took it."""
@@ -116,12 +118,13 @@ def set_camera(services: ServicesDep, photo: PhotoDep, body: PhotoPatch) -> Tabl
 
 
 @router.delete("/{photo}", status_code=status.HTTP_204_NO_CONTENT, responses=problems(404, 507))
-def remove(services: ServicesDep, photo: PhotoDep) -> None:
-    """Delete a photo; tables and goals that were made of it stay."""
-    services.photos.remove(photo.id)
+def remove(services: ServicesDep, photo: PhotoPath) -> None:
+    """Delete a photo, damaged or not; tables and goals that were made of it stay."""
+    with named_in_path():
+        services.photos.remove(photo)
 
 
-@router.put("/{photo}/objects/{name}", responses=problems(404, 503, 507))
+@router.put("/{photo}/objects/{name}", responses=problems(404, 409, 503, 507))
 @slow
 def mark(services: ServicesDep, photo: PhotoDep, name: ObjectPath, body: MarkIn) -> TablePhotoOut:
     """Point at an object, or anew; its mask is found."""
@@ -129,7 +132,7 @@ def mark(services: ServicesDep, photo: PhotoDep, name: ObjectPath, body: MarkIn)
         return _out(services, services.photos.mark(photo.id, name, body.mark()))
 
 
-@router.delete("/{photo}/objects/{name}", responses=problems(404, 507))
+@router.delete("/{photo}/objects/{name}", responses=problems(404, 409, 507))
 @slow
 def unmark(services: ServicesDep, photo: PhotoDep, name: ObjectPath) -> TablePhotoOut:
     """Forget what was marked of an object."""
@@ -169,13 +172,13 @@ def make_goal(services: ServicesDep, photo: PhotoDep, body: MakeGoalIn) -> GoalM
     return GoalMadeOut(scene=scene, notes=list(made.notes), goal=GoalOut.of(made.goal))
 
 
-@router.get("/{photo}/photo.jpg", response_class=FileResponse, responses={**problems(404), **JPEG})
+@router.get("/{photo}/photo.jpg", response_class=FileResponse, responses={**problems(404, 409), **JPEG})
 def picture(services: ServicesDep, photo: PhotoDep) -> OpenFile:
     """Show a photo, upright, no side longer than 2048 px."""
     return OpenFile(services.photos.picture(photo.id), f"{photo.name} has been deleted.", media_type="image/jpeg")
 
 
-@router.get("/{photo}/objects/{name}/mask.png", response_class=FileResponse, responses={**problems(404), **PNG})
+@router.get("/{photo}/objects/{name}/mask.png", response_class=FileResponse, responses={**problems(404, 409), **PNG})
 def mask(services: ServicesDep, photo: PhotoDep, name: ObjectPath) -> OpenFile:
     """Show the mask of a marked object."""
     with named_in_path():

@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field, model_validator
 
 from app.api.schemas.common import Input, LightIn, ObjectPose, SceneObject, Seed
 from app.api.schemas.limits import GOAL_NAME, NAME, OBJECTS, sized, within
-from app.api.schemas.paging import PageOut
+from app.api.schemas.paging import DamagedOut, PageOut
 from app.services.goals.goal_checks import GoalCheck, GoalVerdict
 from app.services.goals.goals import Draft
 from app.storage.photos import PhotoCrop
@@ -159,6 +159,7 @@ class GoalList(PageOut):
     """Goals, newest first."""
 
     goals: list[GoalOut]
+    damaged: list[DamagedOut] = Field(description="What can only be deleted, on each page.")
 
 
 class DraftOut(BaseModel):

@@ -34,6 +34,13 @@ class Entry(Protocol):
 Listed = TypeVar("Listed", bound=Entry)
 
 
+class DamagedOut(BaseModel):
+    """Something of which the files are damaged, so that it can only be deleted."""
+
+    id: str
+    reason: str = Field(description="What is wrong with it.")
+
+
 class JobPageOut(BaseModel):
     """Where a page of jobs of whatever kind stands in the list."""
 
@@ -51,17 +58,20 @@ class PageOut(BaseModel):
 def page(
     entries: Sequence[Listed], limit: int, after: str | None, *, newest_first: bool
 ) -> tuple[list[Listed], int, str | None]:
-    """Some of the entries, how many there are, and where the next page begins (None at the end).
+    """Return some of the entries, how many there are, and where the next page begins (None at the end).
 
     Args:
-        entries: all of them, in any order.
+        entries: all of them in their order, which is not that of their times if the clock was set back.
         limit: how many at most.
-        after: key of the entry before the page; it may be gone meanwhile.
+        after: key of the entry before the page; if it is gone meanwhile, its time says where the page begins.
         newest_first: the order.
     """
-    ordered = sorted(entries, key=_key, reverse=newest_first)
-    rest = [e for e in ordered if after is None or (_key(e) < after if newest_first else _key(e) > after)]
-    shown = rest[:limit]
+    keys = [_key(entry) for entry in entries]
+    if after is None or after in keys:
+        rest = entries[0 if after is None else keys.index(after) + 1 :]
+    else:
+        rest = [e for e in entries if (_key(e) < after if newest_first else _key(e) > after)]
+    shown = list(rest[:limit])
     return shown, len(entries), _key(shown[-1]) if len(rest) > limit else None
 
 

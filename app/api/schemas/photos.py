@@ -24,7 +24,7 @@ from app.api.schemas.limits import (
     sized,
     within,
 )
-from app.api.schemas.paging import PageOut
+from app.api.schemas.paging import DamagedOut, PageOut
 from app.jobs.job import Job
 from app.jobs.kinds.photos import sheet_name
 from app.processes.messages.photo_messages import CameraSource, Mark, Points, Stroke
@@ -184,6 +184,7 @@ class PhotoList(PageOut):
     """Photos of tables, newest first."""
 
     photos: list[PhotoFacts]
+    damaged: list[DamagedOut] = Field(description="What can only be deleted, on each page.")
 
 
 class TableMadeOut(BaseModel):

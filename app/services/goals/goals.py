@@ -16,10 +16,11 @@ from app.processes.messages.scene_messages import ComposedGoal, ComposeGoal
 from app.services.runner import Runner
 from app.storage.database import now_utc
 from app.storage.photos import Photo, PhotoCrop, PhotoReader, central_crop, check_crop, cut_out
-from app.storage.records import GoalRecord, GoalStore, PhotoRecord, Poses, Source
+from app.storage.records import Damaged, GoalRecord, GoalStore, PhotoRecord, Poses, Source
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
+from osfcore.io.files import reading_png
 
 GOAL_SIDE = 256  # of images that are made here [px]
 _MISPLACED = (OverlappingObjects, InvalidInput)  # what a hand can do wrong while it composes
@@ -107,11 +108,16 @@ class Goals:
         """All goals, newest first."""
         return self._store.all()
 
+    def damaged(self) -> tuple[Damaged, ...]:
+        """Goals that can only be deleted."""
+        return self._store.damaged()
+
     def get(self, goal: str) -> GoalRecord:
         """One goal.
 
         Raises:
             UnknownName: if there is none.
+            CorruptFile: if it is damaged.
         """
         return self._store.get(goal)
 
@@ -124,7 +130,7 @@ class Goals:
         return self._store.photo(goal)
 
     def remove(self, goal: str) -> None:
-        """Delete a goal.
+        """Delete a goal, damaged or not.
 
         Raises:
             UnknownName: if there is none.
@@ -163,6 +169,7 @@ class Goals:
             UnknownName: if there is no such goal.
             NoPhoto: if it was not cut out of a photo.
             InvalidInput: if the part is too small, or beside the photo.
+            CorruptFile: if the photo is damaged.
             CannotStore: if the disk is full.
         """
         record = self.get(goal)
@@ -170,7 +177,8 @@ class Goals:
             raise NoPhoto(record.name)
         size = record.photo.width, record.photo.height
         check_crop(crop, *size, record.camera)
-        with Image.open(self.photo(goal)) as image:
+        path = self.photo(goal)
+        with reading_png(path, "it is damaged; upload the photo again"), Image.open(path) as image:
             pixels = cut_out(Photo(np.asarray(image.convert("RGB")), *size), crop, record.camera)
         camera = record.camera.resized(pixels.shape[1], pixels.shape[0])
         record = replace(record, camera=camera, photo=PhotoRecord(*size, crop))

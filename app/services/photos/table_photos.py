@@ -19,8 +19,8 @@ from app.services.fields import FieldCatalogue
 from app.services.photos.photo_looker import PhotoLooker
 from app.services.runner import Runner
 from app.storage.database import CannotStore, now_utc
-from app.storage.records import PICTURE, STRAIGHT, MarkedObject, TablePhoto, TablePhotoStore, mask_file
-from osfcore.errors import InvalidInput, NotThere, OsfError, UnknownName, check_seed
+from app.storage.records import PICTURE, STRAIGHT, Damaged, MarkedObject, TablePhoto, TablePhotoStore, mask_file
+from osfcore.errors import CorruptFile, InvalidInput, NotThere, OsfError, UnknownName, check_seed
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.files import read_json
 from osfcore.io.json_codec import decode
@@ -82,11 +82,16 @@ class TablePhotos:
         """All photographs, newest first."""
         return self._store.all()
 
+    def damaged(self) -> tuple[Damaged, ...]:
+        """Photographs that can only be deleted."""
+        return self._store.damaged()
+
     def get(self, photo: str) -> TablePhoto:
         """One photograph.
 
         Raises:
             UnknownName: if there is none.
+            CorruptFile: if it is damaged.
         """
         return self._store.get(photo)
 
@@ -133,13 +138,14 @@ class TablePhotos:
         return self._outdated(photo, lambda latest: replace(latest, **facts, notes=read.notes), files)
 
     def remove(self, photo: str) -> None:
-        """Delete a photograph; tables and goals that were made of it stay.
+        """Delete a photograph, damaged or not; tables and goals that were made of it stay.
 
         Raises:
             UnknownName: if there is none.
             CannotStore: if that is not allowed.
         """
-        self._end_search(self.get(photo))
+        with contextlib.suppress(CorruptFile):  # then nobody knows which search it began
+            self._end_search(self.get(photo))
         self._store.remove(photo)
         self._runner.storage.outdate()
         self._runner.hub.publish(PhotosChanged())

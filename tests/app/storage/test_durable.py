@@ -1,14 +1,17 @@
 import os
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from app.jobs.folders import JobFolders
 from app.storage.field_files import install
-from app.storage.records import GoalStore
+from app.storage.records import GoalStore, TablePhotoStore, mask_file
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
 from osfcore.io.files import folder_at_once, put_in_place, write_atomically
-from tests.app.storage.test_records import PNG, goal
+from osfcore.io.image_file import write_png
+from tests.app.storage.test_records import JPEG, PNG, goal, table_photo
 
 
 @pytest.fixture
@@ -77,6 +80,32 @@ def test_a_changed_goal_outlives_a_power_failure(tmp_path, synced):
 def test_goals_outlive_a_power_failure(tmp_path, synced):
     GoalStore(tmp_path / "goals", 3).keep(goal("a"), PNG)
     assert is_safe(synced, tmp_path / "goals" / "a")
+
+
+def test_a_deleted_goal_stays_deleted_after_a_power_failure(tmp_path, synced):
+    store = GoalStore(tmp_path / "goals", 3)
+    store.keep(goal("a"), PNG)
+    synced.clear()
+    store.remove("a")
+    assert isinstance(synced[0], str)  # it loses its name, and then that is put on the disk
+    assert (tmp_path / "goals").stat().st_ino in synced[1:]
+
+
+def test_what_is_changed_of_a_photo_outlives_a_power_failure(tmp_path, synced):
+    store = TablePhotoStore(tmp_path / "photos", 3)
+    store.keep(table_photo("p"), b"sent", JPEG)
+    synced.clear()
+    store.change("p", lambda photo: replace(photo, job="j"), {mask_file("mug"): PNG})
+    for name in (mask_file("mug"), "photo.json"):
+        assert is_safe(synced, store.picture("p").with_name(name))
+    synced.clear()
+    store.change("p", lambda photo: photo, {mask_file("mug"): None})
+    assert store.picture("p").parent.stat().st_ino in synced
+
+
+def test_pictures_of_episodes_outlive_a_power_failure(tmp_path, synced):
+    write_png(tmp_path / "frames" / "000.png", np.zeros((8, 8, 3), np.uint8))
+    assert is_safe(synced, tmp_path / "frames" / "000.png")
 
 
 def test_inputs_of_a_job_outlive_a_power_failure(tmp_path, synced):

@@ -8,11 +8,13 @@ import pytest
 
 from app.processes.messages.photo_messages import Mark, Stroke
 from app.storage.database import CannotStore
+from app.storage.photos import PhotoCrop
 from app.storage.records import (
     IMAGE,
     GoalRecord,
     GoalStore,
     MarkedObject,
+    PhotoRecord,
     TablePhoto,
     TablePhotoStore,
     TooManyGoals,
@@ -20,12 +22,14 @@ from app.storage.records import (
     mask_file,
     poses_to_json,
 )
-from osfcore.errors import UnknownName
+from osfcore.errors import CorruptFile, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
+from osfcore.io.image_file import encode_jpeg, encode_png
 from tests.support.errors import about
 
-PNG = b"\x89PNG picture"
+PNG = encode_png(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+JPEG = encode_jpeg(np.zeros((8, 8, 3), np.uint8))
 POSES = (("box", Pose(np.array([0.1, 0.2, 0.3]), np.array([0.6, 0.8, 0, 0]))),)
 
 
@@ -58,10 +62,41 @@ def test_a_goal_comes_back_as_it_was(store, tmp_path, changes):
     assert left(tmp_path) == ["a"]
 
 
-def test_the_newest_comes_first(store):
+def test_the_newest_comes_first_also_when_the_clock_went_back(store, tmp_path):
     for name, day in (("a", 2), ("b", 3), ("c", 1)):
         store.keep(goal(name, f"2026-01-0{day}T00:00:00.000Z"), PNG)
-    assert [record.id for record in store.all()] == ["b", "a", "c"]
+    assert [record.id for record in store.all()] == ["c", "b", "a"]
+    store.replace(store.get("a"), PNG)
+    assert [record.id for record in GoalStore(tmp_path / "goals", 3).all()] == ["c", "b", "a"]
+
+
+def test_goals_of_the_version_before_come_by_their_time_behind_newer_ones(store, tmp_path):
+    for name, day in (("old", 2), ("older", 1)):
+        store.keep(goal(name, f"2026-01-0{day}T00:00:00.000Z"), PNG)
+        change_facts(tmp_path, name, lambda facts: facts.pop("number"))
+    store.keep(goal("new", "2025-01-01T00:00:00.000Z"), PNG)
+    assert [record.id for record in store.all()] == ["new", "old", "older"]
+
+
+BEFORE = """{
+ "id": "g", "name": "Mine", "created_at": "2026-01-01T00:00:00.000Z", "source": "photo", "scene": "s", "example": null,
+ "camera": {
+  "name": "goal", "T_world_camera": [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.5], [0.0, 0.0, -1.0, 0.75], [0, 0, 0, 1]],
+  "K": [[80.0, 0.0, 32.0], [0.0, 80.0, 32.0], [0.0, 0.0, 1.0]], "width": 64, "height": 48
+ },
+ "objects": [{"name": "box", "position": [0.1, 0.2, 0.3], "quaternion": [0.6, 0.8, 0, 0]}],
+ "photo": {"width": 300, "height": 200, "crop": {"left": 1, "top": 2.5, "width": 64.0, "turn_deg": -3.0}}
+}"""
+
+
+def test_a_file_of_the_version_before_is_read(store, tmp_path):
+    store.keep(goal("g"), PNG)
+    (tmp_path / "goals" / "g" / "goal.json").write_text(BEFORE)
+    found = store.get("g")
+    assert (found.name, found.source, found.scene, found.example) == ("Mine", "photo", "s", None)
+    assert found.photo == PhotoRecord(300, 200, PhotoCrop(1, 2.5, 64, -3))
+    assert (found.camera.height, found.camera.T_world_camera.position.tolist()) == (48, [0, 0.5, 0.75])
+    assert poses_to_json(found.poses) == poses_to_json(POSES)
 
 
 def test_there_is_an_end_to_what_is_kept(store, tmp_path):
@@ -142,6 +177,25 @@ def test_a_goal_that_may_not_be_removed_stays(store, tmp_path, monkeypatch):
     assert (tmp_path / "goals" / "a" / IMAGE).read_bytes() == PNG
 
 
+def change_facts(tmp_path, name, change):
+    path = tmp_path / "goals" / name / "goal.json"
+    facts = json.loads(path.read_text())
+    change(facts)
+    path.write_text(json.dumps(facts))
+
+
+def check_b_is_damaged(store):
+    """It is listed as such beside goal a, cannot be used, and can be removed."""
+    assert [record.id for record in store.all()] == ["a"]
+    assert [record.id for record in store.damaged()] == ["b"]
+    with pytest.raises(CorruptFile, check=about(store.damaged()[0].reason)):
+        store.get("b")
+    store.remove("b")
+    assert ([record.id for record in store.all()], store.damaged()) == (["a"], ())
+    with pytest.raises(UnknownName):
+        store.get("b")
+
+
 def odd(**changes):
     return lambda facts: facts.update(changes)
 
@@ -176,26 +230,51 @@ def odd_pose(**changes):
         dict.clear,
     ],
 )
-def test_a_damaged_goal_hides_itself_and_no_other(store, tmp_path, damage):
+def test_a_damaged_goal_hides_no_other_and_can_be_removed(store, tmp_path, damage):
     store.keep(goal("a"), PNG)
     store.keep(goal("b"), PNG)
-    path = tmp_path / "goals" / "b" / "goal.json"
-    facts = json.loads(path.read_text())
-    damage(facts)
-    path.write_text(json.dumps(facts))
-    assert [record.id for record in store.all()] == ["a"]
-    with pytest.raises(UnknownName):
-        store.get("b")
+    change_facts(tmp_path, "b", damage)
+    check_b_is_damaged(store)
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"[]", b"{", b'{"a":' * 100_000, b"\xff\xfe", b'{"id": ' + b"9" * 5000 + b"}"]
 )
-def test_what_is_no_json_hides_no_other(store, tmp_path, content):
+def test_what_is_no_json_is_damaged_and_hides_no_other(store, tmp_path, content):
     store.keep(goal("a"), PNG)
     (tmp_path / "goals" / "b").mkdir()
     (tmp_path / "goals" / "b" / "goal.json").write_bytes(content)
-    assert [record.id for record in store.all()] == ["a"]
+    check_b_is_damaged(store)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", PNG[: len(PNG) // 2], PNG[:40] + b"\0" + PNG[41:], b"GIF89a", None],
+    ids=["empty", "half", "garbled", "something else", "gone"],
+)
+def test_a_goal_without_a_whole_picture_is_damaged(store, tmp_path, content):
+    for name in "ab":
+        store.keep(goal(name), PNG)
+    path = store.image("b")
+    path.unlink() if content is None else path.write_bytes(content)
+    check_b_is_damaged(store)
+
+
+def test_a_goal_that_was_damaged_while_it_was_known_is_found_to_be(store):
+    for name in "ab":
+        store.keep(goal(name), PNG)
+    assert store.get("b").id == "b"
+    store.image("b").write_bytes(PNG[:-8])
+    check_b_is_damaged(store)
+
+
+def test_one_goal_is_had_without_reading_the_others(store, monkeypatch):
+    for name in "abc":
+        store.keep(goal(name), PNG)
+    read, usual = [], Path.read_text
+    monkeypatch.setattr(Path, "read_text", lambda path, **given: read.append(path.parent.name) or usual(path, **given))
+    assert store.get("b").id == "b"
+    assert set(read) <= {"b"}
 
 
 def test_what_a_killed_service_left_half_done_goes_at_the_next_start(store, tmp_path):
@@ -227,28 +306,28 @@ def table_photo(name="p1", **changes):
 
 @pytest.fixture
 def photos(tmp_path):
-    return TablePhotoStore(tmp_path / "photos", 2)
+    return TablePhotoStore(tmp_path / "photos", 3)
 
 
 def test_a_photo_is_read_as_it_was_kept(photos):
     kept = table_photo(job="j", scene="s", T_table_photo=BOARD)
-    photos.keep(kept, b"sent", b"shown")
+    photos.keep(kept, b"sent", JPEG)
     read = photos.get("p1")
     assert read.objects == kept.objects
     assert (read.source, read.notes, read.job, read.scene) == ("board", ("A note.",), "j", "s")
     np.testing.assert_array_equal(read.K, K)
     for pose in (read.T_world_camera, read.T_table_photo):
         np.testing.assert_allclose(pose.matrix(), BOARD.matrix(), atol=1e-12)
-    assert (photos.sent("p1").read_bytes(), photos.picture("p1").read_bytes()) == (b"sent", b"shown")
+    assert (photos.sent("p1").read_bytes(), photos.picture("p1").read_bytes()) == (b"sent", JPEG)
 
 
 def test_a_photo_without_a_board_has_no_pose(photos):
-    photos.keep(table_photo(T_world_camera=None, source="assumed", objects=()), b"", b"")
+    photos.keep(table_photo(T_world_camera=None, source="assumed", objects=()), b"", JPEG)
     assert photos.get("p1").T_world_camera is None
 
 
 def test_other_facts_take_the_place_of_those_before_with_files(photos):
-    photos.keep(table_photo(objects=()), b"", b"")
+    photos.keep(table_photo(objects=()), b"", JPEG)
     with_choice = (replace(MUG, choice=2),)
     files = {mask_file(MUG.name): b"png"}
     photos.change("p1", lambda latest: replace(latest, objects=with_choice), files)
@@ -257,21 +336,23 @@ def test_other_facts_take_the_place_of_those_before_with_files(photos):
 
 
 def test_only_so_many_photos_are_kept_and_one_may_go(photos):
-    for name in ("p1", "p2"):
-        photos.keep(table_photo(name), b"", b"")
+    for name in ("p1", "p2", "p3"):
+        photos.keep(table_photo(name), b"", JPEG)
     with pytest.raises(TooManyPhotos):
-        photos.keep(table_photo("p3"), b"", b"")
+        photos.keep(table_photo("p4"), b"", JPEG)
     photos.remove("p1")
-    assert [photo.id for photo in photos.all()] == ["p2"]
+    assert [photo.id for photo in photos.all()] == ["p3", "p2"]
     with pytest.raises(UnknownName, check=about("photo")):
         photos.get("p1")
 
 
 def test_a_damaged_photo_does_not_hide_the_others(photos):
-    for name in ("p1", "p2"):
-        photos.keep(table_photo(name), b"", b"")
+    for name in ("p1", "p2", "p3"):
+        photos.keep(table_photo(name), b"", JPEG)
     (photos.picture("p1").parent / "photo.json").write_text("{")
-    assert [photo.id for photo in photos.all()] == ["p2"]
+    photos.picture("p2").write_bytes(JPEG[:-9])
+    assert [photo.id for photo in photos.all()] == ["p3"]
+    assert {photo.id for photo in photos.damaged()} == {"p1", "p2"}
 
 
 def test_an_object_marked_again_keeps_its_place_among_the_others():

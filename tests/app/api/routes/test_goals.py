@@ -286,11 +286,22 @@ def test_a_scene_that_a_job_drives_is_left_alone(service, held):
 
 
 @pytest.mark.parametrize(("method", "tail"), [("get", ""), ("delete", ""), ("get", "/image.png")])
-def test_missing_goals_are_not_found(service, services, method, tail):
+def test_missing_goals_are_not_found(service, method, tail):
     is_problem(getattr(service, method)(f"/api/goals/none{tail}"), 404)
-    goal = upload(service, photo()).json()
-    services.goals.image(goal["id"]).unlink()
-    is_problem(service.get(f"/api/goals/{goal['id']}/image.png"), 404)
+
+
+def test_a_goal_with_half_a_picture_is_listed_as_damaged_until_it_is_deleted(service, services):
+    path = f"/api/goals/{upload(service, photo()).json()['id']}"
+    image = services.goals.image(path.rpartition("/")[2])
+    image.write_bytes(image.read_bytes()[:-200])
+    listed = service.get("/api/goals").json()
+    assert [path.endswith(each["id"]) and each["reason"] != "" for each in listed["damaged"]] == [True]
+    assert not any(path.endswith(each["id"]) for each in listed["goals"])
+    for tail in ("", "/image.png", "/check"):
+        assert "delete it" in is_problem(service.get(path + tail), 409)["detail"]
+    assert service.delete(path).status_code == 204
+    assert service.get("/api/goals").json()["damaged"] == []
+    is_problem(service.get(path), 404)
 
 
 def test_photos_may_be_larger_than_other_bodies():

@@ -29,7 +29,7 @@ ENTRIES = [Made(name, f"2026-01-0{1 + number // 2}T00:00:00.000Z") for number, n
 def test_pages_put_together_are_the_list(newest_first, order):
     seen, after = "", None
     for expected_left in (4, 2, 0):
-        shown, total, after = page(ENTRIES[::-1], 2, after, newest_first=newest_first)
+        shown, total, after = page(ENTRIES[:: -1 if newest_first else 1], 2, after, newest_first=newest_first)
         seen += "".join(entry.id for entry in shown)
         assert total == 6
         assert len(seen) == 6 - expected_left
@@ -37,10 +37,18 @@ def test_pages_put_together_are_the_list(newest_first, order):
 
 
 def test_a_page_goes_on_where_its_entry_was_even_if_that_has_gone():
-    _, _, after = page(ENTRIES, 3, None, newest_first=True)
-    without = [entry for entry in ENTRIES if entry.id != "d"]
-    newer = [*without, Made("g", "2026-01-09T00:00:00.000Z")]
+    _, _, after = page(ENTRIES[::-1], 3, None, newest_first=True)
+    without = [entry for entry in ENTRIES[::-1] if entry.id != "d"]
+    newer = [Made("g", "2026-01-09T00:00:00.000Z"), *without]
     assert "".join(entry.id for entry in page(newer, 9, after, newest_first=True)[0]) == "cba"
+
+
+def test_what_was_made_after_the_clock_went_back_is_the_newest():
+    entries, after, seen = [Made("z", "2025-01-01T00:00:00.000Z"), *ENTRIES[::-1]], None, ""
+    for _ in range(3):
+        shown, _, after = page(entries, 3, after, newest_first=True)
+        seen += "".join(entry.id for entry in shown)
+    assert (seen, after) == ("zfedcba", None)
 
 
 @pytest.mark.parametrize(("path", "key"), LISTS.items())

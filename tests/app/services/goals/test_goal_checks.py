@@ -19,6 +19,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from tests.app.storage.test_database import record
+from tests.app.storage.test_records import PNG
 from tests.support.errors import about
 
 LABELS = {"x": "Cracker box", "y": "Mug", "z": "Bowl"}
@@ -75,10 +76,10 @@ def goals(tmp_path):
     goals = GoalStore(tmp_path / "goals", 10)
     photo = PhotoRecord(100, 80, PhotoCrop(0, 0, 80))
     uploaded = GoalRecord("photo", "Mine", "2026", "upload", None, goal_camera(64), None, photo=photo)
-    goals.keep(uploaded, b"PNG")
+    goals.keep(uploaded, PNG)
     for key, names, home in (("made", "xy", "s"), ("other", "z", "t"), ("orphan", "z", "gone")):
         poses = tuple((name, Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))) for name in names)
-        goals.keep(replace(uploaded, id=key, source="composed", scene=home, poses=poses, photo=None), b"PNG")
+        goals.keep(replace(uploaded, id=key, source="composed", scene=home, poses=poses, photo=None), PNG)
     return goals
 
 
@@ -120,8 +121,8 @@ def test_a_photo_is_looked_at_once_until_it_is_cropped(checks, link, goals):
         checks.check("photo", "s")
     (order,) = link.asked
     assert isinstance(order, CheckPhoto)
-    assert (order.photo, order.state.names, order.camera.width) == (b"PNG", ("x", "y"), 64)
-    goals.replace(replace(goals.get("photo"), photo=PhotoRecord(100, 80, PhotoCrop(10, 0, 80))), b"PNG")
+    assert (order.photo, order.state.names, order.camera.width) == (PNG, ("x", "y"), 64)
+    goals.replace(replace(goals.get("photo"), photo=PhotoRecord(100, 80, PhotoCrop(10, 0, 80))), PNG)
     checks.check("photo")
     assert len(link.asked) == 2
 

@@ -29,7 +29,7 @@ from app.storage.database import CannotStore
 from app.storage.photos import PhotoCrop, PhotoRefused, read_photo
 from app.storage.records import GoalStore, TooManyGoals
 from app.storage.usage import StorageMeter
-from osfcore.errors import InvalidInput, OverlappingObjects, UnknownName
+from osfcore.errors import CorruptFile, InvalidInput, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -37,6 +37,11 @@ from tests.app.storage.test_database import record
 from tests.support.errors import about
 
 OVERLAP = OverlappingObjects("x", "y", 0.003)
+
+
+def picture(number):
+    """A PNG like no other."""
+    return encoded(np.full((4, 4, 3), number, np.uint8))
 
 
 def at(x, y=0.0):
@@ -64,7 +69,7 @@ class Runner:
             raise self.error
         self.commands.append(command)
         poses = dict(self.start) | dict(command.poses)
-        return ComposedGoal(f"picture {len(self.commands)}".encode(), tuple(poses.items()))
+        return ComposedGoal(picture(len(self.commands)), tuple(poses.items()))
 
     def drafts(self):
         return [event.draft for event in self.told if isinstance(event, DraftChanged)]
@@ -160,6 +165,15 @@ def test_what_cannot_be_cropped_stays(goals):
         goals.crop(drawn.id, PhotoCrop(0, 0, 64))
 
 
+def test_a_goal_whose_photo_is_damaged_stays_and_cannot_be_cropped(goals):
+    made = goals.receive(photo(96, 64), "Mine")
+    path = goals.photo(made.id)
+    path.write_bytes(path.read_bytes()[:-400])
+    with pytest.raises(CorruptFile, check=about("photo.jpg")):
+        goals.crop(made.id, PhotoCrop(0, 0, 64))
+    assert goals.get(made.id).photo == made.photo
+
+
 def test_what_is_no_photo_leaves_nothing(goals, runner, tmp_path):
     with pytest.raises(PhotoRefused):
         goals.receive(b"%PDF", "Mine")
@@ -178,7 +192,7 @@ def test_a_layout_by_hand_is_of_the_scene_that_is_shown_unless_it_says_otherwise
     assert command.light is light
     assert (made.source, made.scene, made.name) == ("composed", "s", "By hand")
     assert same(made.poses, (("x", at(0.1)), ("y", at(0.2))))
-    assert goals.image(made.id).read_bytes() == b"picture 1"
+    assert goals.image(made.id).read_bytes() == picture(1)
     assert runner.told == [GoalsChanged()]
 
 
@@ -240,7 +254,7 @@ def test_a_draft_begins_where_things_are_and_follows_the_hand(goals, runner):
     assert (moved.revision, again.revision) == (2, 3)
     assert goals.draft is again
     assert runner.drafts() == [begun, moved, again]
-    assert goals.draft_image() == b"picture 3"
+    assert goals.draft_image() == picture(3)
 
 
 def test_a_problem_is_told_and_goes_with_its_cause(goals, runner):
@@ -250,7 +264,7 @@ def test_a_problem_is_told_and_goes_with_its_cause(goals, runner):
         bad = goals.move_draft((("x", at(0.2)),))
         assert (bad.problem, goals.draft) == (str(error), bad)
         assert same(bad.poses, (("x", at(0.2)), ("y", at(0.2))))
-        assert goals.draft_image() == b"picture 1"
+        assert goals.draft_image() == picture(1)
         with pytest.raises(DraftUnsound):
             goals.keep_draft("A")
     assert goals.all() == ()
@@ -258,7 +272,7 @@ def test_a_problem_is_told_and_goes_with_its_cause(goals, runner):
     good = goals.move_draft((("x", at(0.1)),))
     assert (good.problem, good.revision) == ("", 4)
     assert same(good.poses, (("x", at(0.1)), ("y", at(0.2))))
-    assert goals.draft_image() == b"picture 2"
+    assert goals.draft_image() == picture(2)
 
 
 @pytest.mark.parametrize(
@@ -287,7 +301,7 @@ def test_a_draft_that_is_kept_becomes_a_goal_and_ends(goals, runner):
     assert (made.source, made.scene, made.name) == ("composed", "s", "By hand")
     assert same(made.poses, draft.poses)
     assert (made.camera.width, made.camera.height) == (GOAL_SIDE, GOAL_SIDE)
-    assert goals.image(made.id).read_bytes() == b"picture 2"
+    assert goals.image(made.id).read_bytes() == picture(2)
     assert goals.draft is None
     assert runner.told[-2:] == [GoalsChanged(), runner.told[-1]]
     assert runner.drafts()[-1] is None
