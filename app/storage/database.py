@@ -271,7 +271,7 @@ class Store:
         """All scenes, oldest first, and the one that is shown; what makes no sense is set aside."""
         records, current = [], None
         for rowid, is_current, *values in self._read(
-            f"SELECT rowid, is_current, {', '.join(_SCENE_COLUMNS)} FROM scenes ORDER BY created_at, rowid"
+            f"SELECT rowid, is_current, {', '.join(_SCENE_COLUMNS)} FROM scenes ORDER BY rowid"
         ):
             row = dict(zip(_SCENE_COLUMNS, values, strict=True))
             try:

@@ -11,19 +11,18 @@ import contextlib
 import json
 import shutil
 import tempfile
-import uuid
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from app.storage.usage import folder_bytes
-from osfcore.errors import CannotWrite
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
-from osfcore.io.files import sync, sync_tree, write_atomically
+from osfcore.io.files import remove_folder, scratch_folder, sync, sync_tree, write_atomically, writing
 
 _ORDER = "order.json"
 _TEMPORARY_PREFIX = ".writing-"
+_TEMPORARY_LIFE_S = 3600.0
 _ASIDE_PREFIX = ".replaced-"  # its folder holds an older field under its name, until the new one is in place
 
 
@@ -45,13 +44,10 @@ def open_workshop(data_dir: Path, name: str, order: dict[str, Any]) -> Path:
     """
     place = workshop(data_dir, name)
     text = json.dumps(order, sort_keys=True)
-    try:
+    with writing(place):
         if not (place / _ORDER).is_file() or (place / _ORDER).read_bytes() != text.encode():
             clear_workshop(data_dir, name)
-            place.mkdir(parents=True)
             write_atomically(place / _ORDER, text.encode())
-    except OSError as error:
-        raise CannotWrite(place, error.strerror or str(error)) from error
     return place
 
 
@@ -92,13 +88,8 @@ def remove_workshop(data_dir: Path, name: str) -> None:
     Raises:
         CannotWrite: if that is not allowed.
     """
-    place = workshop(data_dir, name)
-    aside = place.with_name(f"{_TEMPORARY_PREFIX}{name}-{uuid.uuid4().hex[:12]}")
-    try:
-        place.rename(aside)
-    except OSError as error:
-        raise CannotWrite(Path("training") / name, error.strerror or str(error)) from error
-    shutil.rmtree(aside, ignore_errors=True)
+    with writing(Path("training") / name):
+        remove_folder(workshop(data_dir, name))
 
 
 def install(made: Path, place: Path) -> None:
@@ -107,20 +98,15 @@ def install(made: Path, place: Path) -> None:
     Raises:
         CannotWrite: if the disk is full or the folder cannot be written; then nothing is changed.
     """
-    try:
+    with writing(place):
         place.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f"{_TEMPORARY_PREFIX}{place.name}-", dir=place.parent))
-        try:
-            folder = temporary / "new"  # one level down, where nobody looks for fields
+        with _temporary(place) as temporary:
+            folder = temporary / "new"
             folder.mkdir(mode=0o755)
             for name in (FIELD_FILE, METRICS_FILE):
                 shutil.copyfile(made / name, folder / name)
             sync_tree(folder)
             _swap(folder, place)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-    except OSError as error:
-        raise CannotWrite(place, error.strerror or str(error)) from error
 
 
 def install_published(made: Path, weights: Path) -> None:
@@ -129,11 +115,9 @@ def install_published(made: Path, weights: Path) -> None:
     Raises:
         CannotWrite: if the disk is full or the folder cannot be written.
     """
-    try:
+    with writing(weights):
         for name in (METRICS_FILE, FIELD_FILE):  # what is looked for comes last
             write_atomically(weights.with_suffix(Path(name).suffix), (made / name).read_bytes())
-    except OSError as error:
-        raise CannotWrite(weights, error.strerror or str(error)) from error
 
 
 def uninstall_published(weights: Path) -> None:
@@ -142,11 +126,10 @@ def uninstall_published(weights: Path) -> None:
     Raises:
         CannotWrite: if that is not allowed.
     """
-    try:
+    with writing(weights):
         for name in (FIELD_FILE, METRICS_FILE):
             weights.with_suffix(Path(name).suffix).unlink(missing_ok=True)
-    except OSError as error:
-        raise CannotWrite(weights, error.strerror or str(error)) from error
+        sync(weights.parent)
 
 
 def uninstall(place: Path) -> None:
@@ -155,14 +138,9 @@ def uninstall(place: Path) -> None:
     Raises:
         CannotWrite: if that is not allowed.
     """
-    try:
-        trash = Path(tempfile.mkdtemp(prefix=f"{_TEMPORARY_PREFIX}{place.name}-", dir=place.parent))
-        try:
-            place.rename(trash / "old")
-        finally:
-            shutil.rmtree(trash, ignore_errors=True)
-    except OSError as error:
-        raise CannotWrite(place, error.strerror or str(error)) from error
+    with writing(place), _temporary(place) as folder:
+        place.rename(folder / "old")
+        sync(place.parent)
 
 
 def sweep(fields: Path) -> None:
@@ -174,8 +152,14 @@ def sweep(fields: Path) -> None:
                     older.rename(fields / older.name)
         if all((fields / older.name).exists() for older in aside.glob("*")):
             shutil.rmtree(aside, ignore_errors=True)
-    for folder in fields.glob(f"{_TEMPORARY_PREFIX}*"):
-        shutil.rmtree(folder, ignore_errors=True)
+    for folder in fields.glob(".*"):
+        if not folder.name.startswith(_ASIDE_PREFIX):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _temporary(place: Path) -> contextlib.AbstractContextManager[Path]:
+    """A hidden folder beside a field's; what is in it lies one level too deep to be taken for a field."""
+    return scratch_folder(place.parent, f"{_TEMPORARY_PREFIX}{place.name}-", _TEMPORARY_LIFE_S)
 
 
 def _swap(folder: Path, place: Path) -> None:

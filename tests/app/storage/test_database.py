@@ -7,6 +7,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,13 @@ def test_scenes_come_back_bit_for_bit(store, pusher):
     assert state_to_json(found.state) == state_to_json(kept.state)
     assert np.array_equal(found.initial.poses.quaternion, kept.initial.poses.quaternion)
     assert (found.id, found.seed, found.image_size, found.time_s, found.revision) == ("a", 7, 128, 0.4, 1)
+
+
+def test_scenes_are_in_the_order_in_which_they_were_made_whatever_the_clock_said(tmp_path, store):
+    for name, year in (("a", 2026), ("b", 2027), ("c", 2025)):
+        store.save_scene(replace(record(), id=name, created_at=f"{year}-01-01T00:00:00.000Z"))
+    store.save_scene(replace(record(), id="a", revision=7))
+    assert [scene.id for scene in store.scenes()[0]] == ["a", "b", "c"]
 
 
 def test_saving_again_updates_and_current_moves(store):

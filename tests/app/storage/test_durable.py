@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from app.jobs.folders import JobFolders
-from app.storage.field_files import install
+from app.storage.field_files import (
+    install,
+    install_published,
+    open_workshop,
+    remove_workshop,
+    uninstall,
+    uninstall_published,
+)
 from app.storage.records import GoalStore, TablePhotoStore, mask_file
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
 from osfcore.io.files import folder_at_once, put_in_place, write_atomically
@@ -116,6 +123,26 @@ def test_inputs_of_a_job_outlive_a_power_failure(tmp_path, synced):
         folders.take("j", folder)
     assert is_safe(synced, folders.inputs("j"))
     assert (tmp_path / "collections").stat().st_ino in synced
+
+
+def test_deleted_fields_and_leftovers_of_training_stay_deleted_after_a_power_failure(tmp_path, synced):
+    made = tmp_path / "made"
+    made.mkdir()
+    for name in (FIELD_FILE, METRICS_FILE):
+        (made / name).write_text("{}")
+    field, published = tmp_path / "fields" / "mug", tmp_path / "paper_fields" / "mug.safetensors"
+    install(made, field)
+    install_published(made, published)
+    leftover = open_workshop(tmp_path, "mug", {})
+    for place, delete in (
+        (field, lambda: uninstall(field)),
+        (published, lambda: uninstall_published(published)),
+        (leftover, lambda: remove_workshop(tmp_path, "mug")),
+    ):
+        synced.clear()
+        delete()
+        assert not place.exists()
+        assert synced[-1] == place.parent.stat().st_ino
 
 
 def test_fields_outlive_a_power_failure_also_those_that_replace_one(tmp_path, synced):

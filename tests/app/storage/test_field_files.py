@@ -29,7 +29,7 @@ def made(tmp_path):
 
 def test_what_a_kill_left_of_a_removed_workshop_goes_at_the_next_start(tmp_path):
     (open_workshop(tmp_path, "a", {}) / "checkpoint").write_bytes(b"12345")
-    (tmp_path / "training" / ".writing-b-0123").mkdir()
+    (tmp_path / "training" / ".b.0123").mkdir()
     (left,) = workshops(tmp_path)
     assert (left.name, left.bytes) == ("a", 5 + len("{}"))
     sweep(tmp_path / "training")
