@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.cli.commands.collect import CollectObservationCommand
+from app.cli.collect import CollectObservationCommand
 from osfcore.io.observation_file import read_observation, write_observation
 from tests.app.services.test_image_sets import zipped
 from tests.e2e.conftest import watch_errors

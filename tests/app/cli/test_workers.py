@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from app.cli import workers
-from app.cli.commands.train import TrainFieldCommand
+from app.cli.train import TrainFieldCommand
 from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput, OsfError, WorkerDied
 from osfcore.experiments.harness import Piece, TaskCache, results_of

@@ -1,1 +1,0 @@
-"""Evaluations on the command line."""

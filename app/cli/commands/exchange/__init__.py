@@ -1,1 +1,0 @@
-"""The commands that write for other programs, and read what they wrote."""

@@ -1,1 +1,0 @@
-"""`osf robot`: look at a robot, and drive it."""
