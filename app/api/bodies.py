@@ -1,19 +1,24 @@
-"""Bodies of requests: JSON within bounds, and bodies of more than one kind, at which a handler has to look itself."""
+"""Bodies of requests, within bounds, and bodies of answers: images and files."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Coroutine
-from typing import Any, TypeVar
+import os
+import stat
+from collections.abc import Callable, Coroutine, Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
-from fastapi import HTTPException, Request, Response, status
+from fastapi import HTTPException, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import ValidationError
+from starlette.responses import FileResponse
+from starlette.types import Receive, Scope, Send
 
-from app.api.problems import too_large
-from app.api.schemas.common import Input
+from app.api.models import Input
+from app.api.problems import NotFound, too_large
 
 JSON = "application/json"
 SMALL_BODY_BYTES = 256 << 10  # of JSON that describes a scene, a goal or an order
@@ -49,6 +54,11 @@ def kind_of(request: Request) -> str:
     return request.headers.get("content-type", "").split(";")[0].strip().lower()
 
 
+def is_photo(kind: str) -> bool:
+    """Whether a media type may be that of a photo; browsers call formats that they do not know octet-stream."""
+    return kind.startswith("image/") or kind == "application/octet-stream"
+
+
 async def whole_body(request: Request, max_bytes: int) -> bytes:
     """All of it.
 
@@ -59,7 +69,7 @@ async def whole_body(request: Request, max_bytes: int) -> bytes:
     async for chunk in request.stream():
         body += chunk
         if len(body) > max_bytes:
-            raise HTTPException(status.HTTP_413_CONTENT_TOO_LARGE, too_large(max_bytes))
+            raise HTTPException(413, too_large(max_bytes))
     return bytes(body)
 
 
@@ -76,7 +86,7 @@ def bounded_json(body: bytes) -> Any:  # noqa: ANN401  any JSON
 def _checked(members: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(members) > MAX_MEMBERS:
         sentence = f"An object in the body has {len(members)} members; at most {MAX_MEMBERS} are read."
-        raise HTTPException(status.HTTP_422_UNPROCESSABLE_CONTENT, sentence)
+        raise HTTPException(422, sentence)
     return dict(members)
 
 
@@ -94,3 +104,75 @@ def parsed(model: type[Model], body: bytes) -> Model:
     except ValidationError as error:
         entries: list[dict[str, Any]] = [{**entry, "loc": ("body", *entry["loc"])} for entry in error.errors()]
         raise RequestValidationError(entries) from None
+
+
+BINARY = {"schema": {"type": "string", "format": "binary"}}
+
+
+def binary(description: str, *kinds: str) -> dict[int | str, dict[str, Any]]:
+    """The OpenAPI entry of an answer that is a file of one of some media types."""
+    return {200: {"content": dict.fromkeys(kinds, BINARY), "description": description}}
+
+
+def upload(*kinds: str, description: str | None = None) -> dict[str, Any]:
+    """The OpenAPI entry of a request whose body is a file of one of some media types."""
+    body = {"required": True, "content": dict.fromkeys(kinds, BINARY)}
+    return {"requestBody": body if description is None else {**body, "description": description}}
+
+
+PNG = binary("The image.", "image/png")
+JPEG = binary("The photo.", "image/jpeg")
+FORGOTTEN: dict[int | str, dict[str, Any]] = {204: {"description": "It is gone, with all its files."}}
+Forget = Annotated[
+    bool, Query(description="Remove one that has finished for good, with all its files; nothing is answered then.")
+]
+
+
+class OpenFile(FileResponse):
+    """A file that is opened now: headers and content are of the same version, also those of a range.
+
+    Args:
+        path: of the file.
+        gone: the sentence of the problem if there is none.
+        media_type: of its content.
+        headers: further ones.
+        filename: under which it is saved; None if it is only shown.
+        disposition: whether a browser saves it or shows it, if it has a filename.
+
+    Raises:
+        NotFound: if there is no such file, or no plain one.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        gone: str,
+        *,
+        media_type: str,
+        headers: Mapping[str, str] | None = None,
+        filename: str | None = None,
+        disposition: str = "attachment",
+    ) -> None:
+        try:
+            self._file = path.open("rb", buffering=0)
+        except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+            raise NotFound(gone) from None
+        status = os.fstat(self._file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            self._file.close()
+            raise NotFound(gone)
+        super().__init__(
+            f"/dev/fd/{self._file.fileno()}",  # opened again, it is the same file, whatever has its name by then
+            headers=headers,
+            media_type=media_type,
+            filename=filename,
+            stat_result=status,
+            content_disposition_type=disposition,
+        )
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the file and close it, also if whoever asked has gone."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._file.close()

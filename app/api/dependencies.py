@@ -1,23 +1,29 @@
-"""What request handlers reach for, in one object on the app."""
+"""What request handlers reach for: the running parts of the service, and threads to wait in."""
 
 from __future__ import annotations
 
+import asyncio
+import functools
 import threading
 import time
-from dataclasses import dataclass, field
-from typing import Annotated
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from fastapi import Depends, Request
+from pydantic import BaseModel
 from starlette.requests import HTTPConnection
 
-from app.api.event_texts import EventTexts
-from app.api.lanes import Lanes
-from app.api.schemas.common import SceneOut
-from app.processes.messages.scene_messages import SceneRecord
-from app.processes.process_client import ProcessClient
+from app.processes.predict_process import predictor_main
+from app.processes.process_client import ProcessBusy, ProcessClient
+from app.processes.render_process import renderer_main
 from app.services.disturber import Disturber
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
+from app.services.examples.presets import OPENING, preset
 from app.services.fields import FieldCatalogue
 from app.services.goals.goal_checks import GoalChecks
 from app.services.goals.goals import Goals
@@ -27,15 +33,145 @@ from app.services.photos.board_photos import BoardPhotos
 from app.services.photos.photo_tables import PhotoTables
 from app.services.photos.table_photos import TablePhotos
 from app.services.predictions import Predictions
-from app.services.robots.robot_table import RobotTable
-from app.services.runner import Runner
+from app.services.robot import RobotTable
+from app.services.runner import DemoScene, Runner
 from app.services.service_settings import Settings
-from app.services.visitors.driver import Driver
+from app.services.visitors.driver import GRACE_S, Driver
 from app.services.visitors.look_outlines import Outliner
 from app.storage.database import Store
+from app.storage.photos import PhotoReader
 from app.viewer import Viewer
+from osfcore.errors import OsfError
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import CATALOGUE
+
+Result = TypeVar("Result")
+_SLOW_THREADS, _SLOW_WAITING = 8, 64
+_URGENT_THREADS, _URGENT_WAITING = 8, 256
+
+
+class Lane:
+    """Some threads, and a bound on how many may wait for one.
+
+    Args:
+        name: of the threads.
+        threads: how many.
+        waiting: how many calls may wait at once.
+    """
+
+    def __init__(self, name: str, threads: int, waiting: int) -> None:
+        self._executor = ThreadPoolExecutor(threads, thread_name_prefix=name)
+        self._most = threads + waiting
+        self._inside = 0  # touched by the event loop only
+
+    async def run(self, function: Callable[..., Result], *arguments: Any, **named: Any) -> Result:  # noqa: ANN401
+        """Call a function in a thread of this lane.
+
+        Raises:
+            ProcessBusy: if too many wait already.
+        """
+        if self._inside >= self._most:
+            raise ProcessBusy("service")
+        loop = asyncio.get_running_loop()
+        future = self._executor.submit(functools.partial(function, *arguments, **named))
+        self._inside += 1
+        future.add_done_callback(functools.partial(self._leave, loop))  # not when the client leaves: the thread goes on
+        return await asyncio.wrap_future(future)
+
+    def close(self) -> None:
+        """Take nothing more; threads end with what they do."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+    def _leave(self, loop: asyncio.AbstractEventLoop, _: Future[Any]) -> None:
+        if not loop.is_closed():
+            loop.call_soon_threadsafe(self._count_out)
+
+    def _count_out(self) -> None:
+        self._inside -= 1
+
+
+class Lanes:
+    """The lanes of one app: `slow` for what waits for a child process, `urgent` for what ends or holds work."""
+
+    def __init__(self) -> None:
+        self.slow = Lane("slow", _SLOW_THREADS, _SLOW_WAITING)
+        self.urgent = Lane("urgent", _URGENT_THREADS, _URGENT_WAITING)
+
+    def close(self) -> None:
+        """Take nothing more."""
+        self.slow.close()
+        self.urgent.close()
+
+
+def slow(handler: Callable[..., Result]) -> Callable[..., Any]:
+    """Mark a route's handler, which takes `services`, as one that waits for a child process."""
+    return _in_lane(handler, lambda lanes: lanes.slow)
+
+
+def urgent(handler: Callable[..., Result]) -> Callable[..., Any]:
+    """Mark a route's handler, which takes `services`, as one that must be served whatever others do."""
+    return _in_lane(handler, lambda lanes: lanes.urgent)
+
+
+def _in_lane(handler: Callable[..., Result], choose: Callable[[Lanes], Lane]) -> Callable[..., Any]:
+    @functools.wraps(handler)
+    async def handle(*, services: Services, **named: Any) -> Result:  # noqa: ANN401  the handler's own
+        return await choose(services.lanes).run(handler, services=services, **named)
+
+    return handle
+
+
+MAX_STREAMS = 100
+_KEPT = 32
+
+
+class TooManyStreams(OsfError):
+    """More pages follow the service than it can serve."""
+
+    def __init__(self) -> None:
+        super().__init__(f"{MAX_STREAMS} pages and programs follow this service already, which is the most; close one.")
+
+
+class EventTexts:
+    """The JSON of events. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[int, tuple[object, str]] = OrderedDict()
+        self._streams = 0
+
+    def of(self, source: object, make: Callable[[], BaseModel]) -> str:
+        """The JSON of what `make` returns, which was perhaps made for another stream just now.
+
+        Args:
+            source: frozen; what it is made of.
+            make: called if it has not been made yet.
+        """
+        known = self._kept.get(id(source))
+        if known is not None:
+            return known[1]
+        text = make().model_dump_json()
+        with self._lock:
+            self._kept[id(source)] = source, text  # holding the source keeps its identity from being used again
+            if len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        return text
+
+    @contextmanager
+    def stream(self) -> Iterator[None]:
+        """Count one stream.
+
+        Raises:
+            TooManyStreams: if there are too many.
+        """
+        if self._streams >= MAX_STREAMS:
+            raise TooManyStreams
+        self._streams += 1
+        try:
+            yield
+        finally:
+            self._streams -= 1
+
 
 VISITOR_HEADER = "X-OSF-Visitor"
 _READING = ("GET", "HEAD", "OPTIONS")
@@ -74,43 +210,69 @@ class ObjectCatalogue:
         return self._labels
 
 
-@dataclass(frozen=True)
 class Services:
-    """The running parts of one app."""
+    """The running parts of one app, between `start` and `stop`."""
 
-    settings: Settings
-    store: Store
-    runner: Runner
-    viewer: Viewer
-    objects: ObjectCatalogue
-    fields: FieldCatalogue
-    neural: ProcessClient
-    estimates: Estimates
-    predictions: Predictions
-    goals: Goals
-    goal_checks: GoalChecks
-    photos: TablePhotos
-    photo_tables: PhotoTables
-    board_photos: BoardPhotos
-    episodes: Episodes
-    driver: Driver
-    own_objects: OwnObjects
-    thumbnails: Thumbnails
-    outliner: Outliner
-    disturber: Disturber
-    robot: RobotTable
-    event_texts: EventTexts = field(default_factory=EventTexts)
-    lanes: Lanes = field(default_factory=Lanes)
-    closing: threading.Event = field(default_factory=threading.Event)  # event streams end when it is set
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.event_texts = EventTexts()
+        self.lanes = Lanes()
+        self.closing = threading.Event()  # event streams end when it is set
+        self._stops = ExitStack()
+
+    def start(self) -> None:
+        """Start everything, which takes seconds."""
+        settings, stack = self.settings, self._stops
+        data_dir, opening = settings.data_dir, preset(OPENING)
+        self.store = Store(data_dir, settings.max_stored_events)
+        stack.callback(self.store.close)
+        demo = DemoScene(opening.objects, opening.seed, opening.light)
+        self.runner = Runner(settings, self.store, AssetLibrary(data_dir / "objects"), demo)
+        stack.callback(self.runner.stop)
+        self.runner.start()
+        self.neural = ProcessClient(renderer_main, (data_dir,), "neural renderer")
+        stack.callback(self.neural.stop)
+        self.objects = ObjectCatalogue(self.runner.library)
+        self.fields = FieldCatalogue(data_dir, self.objects.names)
+        self.estimates = Estimates(self.runner, self.fields)
+        stack.callback(self.estimates.stop)
+        predictor = ProcessClient(predictor_main, (data_dir,), "predictor of pushes")
+        stack.callback(predictor.stop)
+        self.predictions = Predictions(self.runner, self.fields.names, predictor)
+        reader = PhotoReader()
+        stack.callback(reader.stop)
+        self.goals = Goals(self.runner, data_dir, settings.max_goals, reader)
+        self.goals.start()
+        self.goal_checks = GoalChecks(self.runner, self.fields, self.goals, self.neural, self.objects.labels)
+        self.photos = TablePhotos(self.runner, self.fields, data_dir, settings.max_photos)
+        stack.callback(self.photos.stop)
+        self.photos.start()
+        self.photo_tables = PhotoTables(self.runner, self.photos, self.goals, self.neural)
+        self.board_photos = BoardPhotos(self.photos.looker.ask)
+        self.viewer = Viewer(self.runner, self.neural, self.fields.names, self.predictions, self.goals)
+        stack.callback(self.viewer.stop)
+        self.viewer.start()
+        self.thumbnails = Thumbnails(self.runner.library, data_dir / "thumbnails")
+        stack.callback(self.thumbnails.stop)
+        self.robot = RobotTable(settings, self.runner, self.fields, self.goals)
+        stack.callback(self.robot.close)
+        self.robot.start()
+        self.episodes = Episodes(self.runner, self.fields, self.goals, self.goal_checks)
+        self.driver = Driver(self.runner.hub.publish, GRACE_S)
+        self.own_objects = OwnObjects(self.runner)
+        self.outliner = Outliner(self.runner.library)
+        self.disturber = Disturber(self.runner, np.random.default_rng())
+        stack.callback(self.lanes.close)
+        stack.callback(self.closing.set)
+
+    def stop(self) -> None:
+        """Stop what has been started, in the reverse order."""
+        self._stops.close()
 
     def begin_closing(self) -> None:
         """End what would keep requests waiting: event streams, and thumbnails that are being drawn. Does not block."""
         self.closing.set()
         threading.Thread(target=self.thumbnails.stop, name="closing", daemon=True).start()
-
-    def scene_out(self, record: SceneRecord) -> SceneOut:
-        """A scene as JSON."""
-        return SceneOut.of(record, self.objects.labels(), is_current=record.id == self.runner.current)
 
 
 async def get_services(connection: HTTPConnection) -> Services:

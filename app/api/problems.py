@@ -10,13 +10,33 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
-from app.api.schemas.common import Problem, ProblemPointer
 from app.storage.paths import without_places
 from osfcore.errors import OsfError, UnknownName
 
 _log = logging.getLogger(__name__)
+
+
+class ProblemPointer(BaseModel):
+    """One thing that is wrong with a request."""
+
+    pointer: str | None = Field(default=None, description="JSON pointer into the request body.")
+    parameter: str | None = Field(default=None, description="Name of the path, query or header parameter.")
+    detail: str
+
+
+class Problem(BaseModel):
+    """An error, as in RFC 9457."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str = Field(description="One sentence for a person.")
+    errors: list[ProblemPointer] | None = None
+
 
 STATUS_OF_KIND = {
     "WrongJobState": 409,
@@ -77,21 +97,21 @@ STATUS_OF_KIND = {
 }
 _MOST_POINTERS = 20  # mistakes that are told of one request
 _LONGEST_TOLD = 1e9  # numbers below this are repeated in a sentence
-_TITLES = {
-    400: "Bad request",
-    401: "Token needed",
-    403: "Forbidden",
-    404: "Not found",
-    405: "Method not allowed",
-    409: "Conflict",
-    413: "Request too large",
-    415: "Unsupported media type",
-    421: "Misdirected request",
-    422: "Invalid input",
-    429: "Too many requests",
-    500: "Internal error",
-    503: "Not available now",
-    507: "Out of space",
+_WORDS = {  # title of each problem, and when routes answer it
+    400: ("Bad request", "The request cannot be read."),
+    401: ("Token needed", "The service needs a token."),
+    403: ("Forbidden", "The request comes from another site."),
+    404: ("Not found", "There is no such thing."),
+    405: ("Method not allowed", "The path does not offer this method."),
+    409: ("Conflict", "It does not fit the present state."),
+    413: ("Request too large", "The request is too large."),
+    415: ("Unsupported media type", "The body is neither JSON nor a zip."),
+    421: ("Misdirected request", "The service is not known under this host name."),
+    422: ("Invalid input", "The input is not valid; the detail says what is allowed."),
+    429: ("Too many requests", "Too many jobs wait already."),
+    500: ("Internal error", "The service failed on this request."),
+    503: ("Not available now", "The simulation, the neural renderer or the predictor is being restarted."),
+    507: ("Out of space", "The disk is full, or the service holds as much as it may."),
 }
 
 
@@ -127,7 +147,8 @@ def problem(
     """
     # Lone surrogates come in through JSON escapes, but no UTF-8 goes out with them.
     clean = detail.encode("utf-8", "replace").decode("utf-8")
-    body = Problem(title=_TITLES.get(status, "Error"), status=status, detail=clean, errors=pointers)
+    title = _WORDS[status][0] if status in _WORDS else "Error"
+    body = Problem(title=title, status=status, detail=clean, errors=pointers)
     return ProblemResponse(body.model_dump(exclude_none=True), status, headers)
 
 
@@ -148,6 +169,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(OsfError, _on_osf_error)
     app.add_exception_handler(HTTPException, _on_http_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
+    app.add_exception_handler(ClientDisconnect, _on_broken_upload)
     app.add_exception_handler(Exception, _on_defect)
 
 
@@ -175,6 +197,10 @@ async def _on_validation_error(_: Request, error: Exception) -> ProblemResponse:
     sentence = _sentence(entries[0]) if entries else "The request cannot be read."
     more = f" There {'is one mistake' if len(entries) == 2 else f'are {len(entries) - 1} mistakes'} more."
     return problem(422, sentence + (more if len(entries) > 1 else ""), pointers)
+
+
+async def _on_broken_upload(_: Request, __: Exception) -> ProblemResponse:
+    return problem(400, "The upload broke off.")
 
 
 async def _on_defect(request: Request, error: Exception) -> ProblemResponse:
@@ -230,3 +256,12 @@ def _pointer(entry: dict[str, Any], body: object) -> ProblemPointer:
         escaped = (part.replace("~", "~0").replace("/", "~1") for part in path)
         return ProblemPointer(pointer="#" + "".join(f"/{part}" for part in escaped), detail=detail)
     return ProblemPointer(parameter="/".join(path), detail=detail)
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI entries for the errors that a route answers, besides those that any route does."""
+    content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {
+        status: {"content": content, "description": _WORDS[status][1]}
+        for status in (400, 403, 413, 421, 422, *statuses)
+    }

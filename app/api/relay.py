@@ -9,21 +9,20 @@ import asyncio
 import contextlib
 import re
 from collections.abc import Callable
-from typing import Annotated
 from urllib.parse import urlsplit
 
 import websockets
-from fastapi import APIRouter, HTTPException, Path, Request, WebSocket
+from fastapi import APIRouter, HTTPException, Request, WebSocket
 from fastapi.responses import HTMLResponse
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from app.api.dependencies import Services, ServicesDep
-from app.api.guards.rate_limit import RateLimit
 from app.api.guards.security import is_same_origin
+from app.api.guards.token_gate import RateLimit
 from app.api.guards.viewer_messages import BURST, CAMERA, DROP, RATE, allowed_kind
-from app.api.schemas.limits import NAME, VISITOR, sized
+from app.api.models import VISITOR, Visitor
 from app.viewer.private_server import PAGE_HEADER, SECRET_HEADER
 from osfcore.errors import shown
 
@@ -42,7 +41,7 @@ _VIEWER = re.compile(rf"/viewer(/{VISITOR})?/?")
 @router.get("/viewer/")
 @router.get("/viewer/{visitor}")
 @router.get("/viewer/{visitor}/")
-def page(request: Request, services: ServicesDep) -> HTMLResponse:
+def client_page(request: Request, services: ServicesDep) -> HTMLResponse:
     """The viewer's client, one file; below what a page calls itself, it is the view of that page.
 
     Scripts of ours come before its own: it makes functions from strings, and expects a graphics card.
@@ -81,9 +80,7 @@ async def relay(browser: WebSocket, services: ServicesDep) -> None:
 
 
 @router.websocket("/viewer/{visitor}")
-async def relay_of_page(
-    browser: WebSocket, services: ServicesDep, visitor: Annotated[str, Path(**sized(NAME), pattern=f"^{VISITOR}$")]
-) -> None:
+async def relay_of_page(browser: WebSocket, services: ServicesDep, visitor: Visitor) -> None:
     """Likewise, telling the viewer in which page the browser shows it."""
     await _relay(browser, services, {PAGE_HEADER: visitor}, visitor)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from osfcore.photo.calibration import board_place
-from tests.app.api.routes.test_calibration import ON_TABLE, TILTS, png_of
-from tests.app.api.routes.test_table_photos import gray
+from tests.app.api.test_calibration import ON_TABLE, TILTS, png_of
+from tests.app.api.test_photos import gray
 from tests.e2e.conftest import leave_out_view, watch_errors
 from tests.live import call, free_port, start_service, stop_service
 from tests.support.boards import K, tilted

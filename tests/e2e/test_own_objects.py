@@ -6,7 +6,7 @@ import urllib.request
 
 import pytest
 
-from tests.app.api.routes.test_own_objects import glb
+from tests.app.api.test_objects import glb
 from tests.e2e.conftest import leave_out_view, watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from osfcore.geometry.cameras import goal_camera
-from tests.app.api.routes.test_table_photos import box_around, jpeg_of
+from tests.app.api.test_photos import box_around, jpeg_of
 from tests.app.conftest import until
 from tests.e2e.conftest import leave_out_view, watch_errors
 from tests.live import call, free_port, start_service, stop_service

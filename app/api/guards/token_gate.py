@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import hmac
 import secrets
+import time
 from collections import OrderedDict
+from collections.abc import Callable
 from urllib.parse import parse_qs
 
 from itsdangerous import BadSignature, TimestampSigner
@@ -17,8 +19,37 @@ from starlette.requests import HTTPConnection
 from starlette.responses import RedirectResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from app.api.guards.rate_limit import RateLimit
 from app.api.problems import problem
+
+
+class RateLimit:
+    """A token bucket.
+
+    Args:
+        rate: tokens that come back [1/s].
+        burst: tokens at most.
+        clock: tells the time [s].
+    """
+
+    def __init__(self, rate: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._rate, self._burst, self._clock = rate, burst, clock
+        self._left, self._then = burst, clock()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no token now."""
+        now = self._clock()
+        self._left = min(self._burst, self._left + (now - self._then) * self._rate)
+        self._then = now
+        return self._left < 1
+
+    def take(self) -> bool:
+        """Take a token; False if there is none."""
+        if self.is_empty:
+            return False
+        self._left -= 1
+        return True
+
 
 COOKIE = "osf_session"
 _LIFE_S = 30 * 24 * 3600

@@ -7,7 +7,7 @@ import pytest
 from app.services.event_hub import Notice
 from app.storage.database import CannotStore
 from osfcore.errors import CannotWrite, CorruptFile
-from tests.app.api.routes.test_events import Stream
+from tests.app.api.test_events import Stream
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import running, until
 from tests.app.services.goals.test_goals import photo

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from app.api.guards.rate_limit import RateLimit
+from app.api.guards.token_gate import RateLimit
 from app.api.guards.viewer_messages import MAX_FRAME_BYTES, allowed_kind
 
 CAMERA = {

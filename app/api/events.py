@@ -1,0 +1,330 @@
+"""The event stream: jobs with replay after a reconnect, the current scene, live images, notices."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import time
+from collections import deque
+from collections.abc import AsyncIterator
+from functools import partial
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Depends, Header, Query
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import BaseModel, Field
+from starlette.concurrency import run_in_threadpool
+
+from app.api.dependencies import Services, ServicesDep
+from app.api.goals import DraftOut
+from app.api.jobs import JobOut
+from app.api.models import Visitor
+from app.api.page import DriverOut
+from app.api.problems import problems
+from app.api.scenes import scene_out
+from app.jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
+from app.jobs.kinds import KINDS
+from app.processes.messages.scene_messages import FramesTaken, SceneChanged
+from app.services.event_hub import CurrentScene, Notice
+from app.services.goals.goals import DraftChanged, GoalsChanged
+from app.services.photos.table_photos import PhotosChanged
+from app.services.visitors.driver import DriverChanged
+from app.storage.paths import without_places
+from osfcore.control.events import Looking
+from osfcore.errors import OsfError, UnknownName
+from osfcore.io.image_file import encode_jpeg
+
+
+class FrameEvent(BaseModel):
+    """Live images, the data of a "frame" event."""
+
+    scene: str
+    revision: int
+    cameras: dict[str, str] = Field(description="Camera name to JPEG data URL.")
+
+
+Points = list[tuple[float, float]]
+
+
+class ObjectOutlinesOut(BaseModel):
+    """An object in one picture; coordinates are shares of its width and height."""
+
+    name: str
+    best: Points = Field(description="Outline of where it is taken to be; empty for what was not looked at yet.")
+    tried: list[Points] = Field(description="The same of some candidates.")
+
+
+class LookEvent(BaseModel):
+    """An estimator at work, the data of a "look" event."""
+
+    look: Literal["first", "goal", "next", "search"] = Field(description="At what: first frame, goal image, ...")
+    share: float = Field(description="Of the work that is done.")
+    loss: float | None = Field(description="Of the whole, in units of its stage.")
+    difference: float | None = Field(
+        description="Of the rendered scene from the images: root of the mean square over all pixels, 0 to 1."
+    )
+    stage: str = Field(description="Of the method; losses of one stage can be compared.")
+    is_over: bool = Field(description="Whether this is the result.")
+    light_deg: tuple[float, float] = Field(description="Azimuth and elevation of the light so far.")
+    cameras: dict[str, list[ObjectOutlinesOut]] = Field(description='By camera; "goal" is the goal image.')
+    pictures: dict[str, str] = Field(
+        default_factory=dict, description="The best scene so far as each camera would see it: JPEG data URLs."
+    )
+
+
+class ForgottenEvent(BaseModel):
+    """A job was removed for good, the data of a "forgotten" event."""
+
+    job: str
+
+
+class NoticeEvent(BaseModel):
+    """A sentence for whoever watches, the data of a "notice" event."""
+
+    level: Literal["info", "warning", "error"]
+    text: str
+
+
+router = APIRouter(prefix="/api", tags=["events"], responses=problems())
+SCENE_INTERVAL_S = 0.1
+FRAME_INTERVAL_S = 0.2
+LOOK_INTERVAL_S = 0.3
+_MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest are dropped
+_LOOK_INTERVAL_S = 0.5
+_MAX_EVENT = 2**63 - 1
+Letter = JobChanged | JobForgotten | Notice | GoalsChanged | PhotosChanged | DriverChanged
+
+
+async def _counted(services: ServicesDep) -> AsyncIterator[None]:
+    with services.event_texts.stream():
+        yield
+
+
+StreamDep = Annotated[None, Depends(_counted)]
+
+
+class Mailbox:
+    """What one page has not been told yet: all jobs and notices, but only the latest scene and images."""
+
+    def __init__(self, current: str | None) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._current = current
+        self.letters: deque[Letter] = deque(maxlen=_MAX_WAITING)
+        self.draft: DraftChanged | None = None
+        self.is_scene_new = True
+        self.frames: FramesTaken | None = None
+        self.look: Looking | None = None
+        self.arrived = asyncio.Event()
+
+    def put(self, event: object) -> None:
+        """Take note of an event, in whatever thread."""
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._put, event)
+
+    async def next_job(self, job: str) -> JobChanged | None:
+        """The next letter about a job; None if there is none for a while."""
+        while self.letters:
+            letter = self.letters.popleft()
+            if isinstance(letter, JobChanged) and letter.job.id == job:
+                return letter
+        self.arrived.clear()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self.arrived.wait(), _LOOK_INTERVAL_S)
+        return None
+
+    def _put(self, event: object) -> None:
+        match event:
+            case JobChanged() | JobForgotten() | Notice() | GoalsChanged() | PhotosChanged() | DriverChanged():
+                self.letters.append(event)
+            case DraftChanged():
+                self.draft = event
+            case CurrentScene(record):
+                self._current = None if record is None else record.id
+                self.is_scene_new, self.frames, self.look = True, None, None
+            case SceneChanged(record):
+                self.is_scene_new = self.is_scene_new or record.id == self._current
+            case JobView(job, Looking() as look) if job.params.get("scene") in (None, self._current):
+                self.look = look
+            case FramesTaken():
+                self.frames = event if event.scene == self._current else self.frames
+        self.arrived.set()
+
+
+@router.get("/events", response_class=EventSourceResponse, responses=problems(503))
+async def stream(
+    services: ServicesDep,
+    counted: StreamDep,
+    frames: Annotated[bool, Query(description="Whether live images are wanted.")] = False,
+    visitor: Annotated[Visitor | None, Query(description="What the page calls itself.")] = None,
+    last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """Follow what happens: job, look, forgotten, scene, frame, goals, photos, draft, driver, notice."""
+    del counted
+    mailbox = Mailbox(services.runner.current)
+    leave = services.runner.hub.subscribe(mailbox.put)
+    is_watching = has_arrived = False
+    try:
+        if frames:
+            is_watching = True  # before the call: a page that leaves during it must be counted out again
+            await run_in_threadpool(services.runner.watch_frames, 1)
+        if visitor is not None:
+            has_arrived = True
+            services.driver.arrive(visitor)
+        yield ServerSentEvent(comment="connected", retry=1000)
+        for entry in services.store.set_aside:
+            yield ServerSentEvent(event="notice", data=NoticeEvent(level="warning", text=entry.sentence))
+        if services.goals.draft is not None:
+            yield _draft_event(services, DraftChanged(services.goals.draft))
+        last = 0
+        if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
+            last = min(int(last_event_id[:19]), _MAX_EVENT)
+            for number, fields in await run_in_threadpool(services.store.events_after, last):
+                last = number
+                replayed = _replayed(services, number, fields)
+                if replayed is not None:
+                    yield replayed
+        async for event in _follow(services, mailbox, last, wants_frames=frames):
+            yield event
+    finally:
+        leave()
+        if visitor is not None and has_arrived:
+            services.driver.leave(visitor)
+        if is_watching:
+            services.runner.watch_frames(-1)
+
+
+async def _follow(
+    services: Services, mailbox: Mailbox, last: int, *, wants_frames: bool
+) -> AsyncIterator[ServerSentEvent]:
+    scene_at = frame_at = look_at = 0.0
+    while not services.closing.is_set():
+        while mailbox.letters:
+            letter = mailbox.letters.popleft()
+            match letter:
+                case Notice():
+                    yield _notice_event(services, letter)
+                case GoalsChanged():
+                    yield ServerSentEvent(event="goals", raw_data="null")
+                case PhotosChanged():
+                    yield ServerSentEvent(event="photos", raw_data="null")
+                case DriverChanged():
+                    yield ServerSentEvent(event="driver", data=DriverOut.model_validate(letter, from_attributes=True))
+                case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already
+                    yield job_event(services, letter.event, letter.job)
+                case JobForgotten() if letter.event > last:
+                    yield _forgotten(letter.event, letter.job.id)
+        if mailbox.draft is not None:
+            changed, mailbox.draft = mailbox.draft, None
+            yield _draft_event(services, changed)
+        now = time.monotonic()
+        if mailbox.is_scene_new and now >= scene_at:
+            mailbox.is_scene_new, scene_at = False, now + SCENE_INTERVAL_S
+            yield _scene_event(services)
+        if mailbox.frames is not None and now >= frame_at:
+            taken, mailbox.frames, frame_at = mailbox.frames, None, now + FRAME_INTERVAL_S
+            if wants_frames:
+                text = services.event_texts.of(taken, partial(_frame, taken))
+                yield ServerSentEvent(event="frame", raw_data=text)
+        if mailbox.look is not None and (now >= look_at or mailbox.look.step.estimate is not None):
+            look, mailbox.look, look_at = mailbox.look, None, now + LOOK_INTERVAL_S
+            text = await run_in_threadpool(services.event_texts.of, look, partial(_look, services, look))
+            yield ServerSentEvent(event="look", raw_data=text)
+        mailbox.arrived.clear()
+        due = [scene_at] * mailbox.is_scene_new + [frame_at] * (mailbox.frames is not None)
+        due += [look_at] * (mailbox.look is not None)
+        timeout = min([_LOOK_INTERVAL_S, *(max(at - time.monotonic(), 0.001) for at in due)])
+        if due:
+            await asyncio.sleep(timeout)
+        elif not mailbox.letters:
+            try:
+                await asyncio.wait_for(mailbox.arrived.wait(), timeout)
+            except TimeoutError:
+                continue
+
+
+async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEvent]:
+    """Events of one job, from how it is now to its end."""
+    mailbox = Mailbox(None)
+    leave = services.runner.hub.subscribe(mailbox.put)
+    try:
+        with contextlib.suppress(UnknownName):  # one that was just removed for good ends as it was
+            job = services.runner.jobs.get(job.id)  # again, now that nothing is missed
+        now = job
+        yield job_event(services, 0, now)
+        while not now.is_finished and not services.closing.is_set():
+            letter = await mailbox.next_job(job.id)
+            if letter is not None:
+                now = letter.job
+                yield job_event(services, letter.event, now)
+    finally:
+        leave()
+
+
+def job_event(services: Services, number: int, job: Job) -> ServerSentEvent:
+    """A job as an event.
+
+    Args:
+        services: of the app.
+        number: of the event; 0 where nothing came after it that could be asked for.
+        job: as it was then.
+    """
+    text = services.event_texts.of(job, partial(JobOut.of, job))
+    return ServerSentEvent(event="job", id=str(number) if number else None, raw_data=text)
+
+
+def _notice_event(services: Services, notice: Notice) -> ServerSentEvent:
+    text = without_places(notice.text, services.settings.data_dir)
+    return ServerSentEvent(event="notice", data=NoticeEvent.model_validate({"level": notice.level, "text": text}))
+
+
+def _forgotten(number: int, job: str) -> ServerSentEvent:
+    return ServerSentEvent(event="forgotten", id=str(number), data=ForgottenEvent(job=job))
+
+
+def _replayed(services: Services, number: int, fields: dict[str, Any]) -> ServerSentEvent | None:
+    """An event as it was told; None if another version wrote it in a way that makes no sense to this one.
+
+    Args:
+        services: of the app.
+        number: of the event.
+        fields: what the store keeps of it.
+    """
+    if "forgotten" in fields:
+        return _forgotten(number, fields["forgotten"])
+    try:
+        job = job_from_fields(fields)
+        return job_event(services, number, job) if job.kind in KINDS else None
+    except (OsfError, TypeError):
+        return None
+
+
+def _scene_event(services: Services) -> ServerSentEvent:
+    current = services.runner.current
+    record = next((r for r in services.runner.scenes() if r.id == current), None)
+    if record is None:
+        return ServerSentEvent(event="scene", raw_data="null")
+    text = services.event_texts.of(record, partial(scene_out, services, record))
+    return ServerSentEvent(event="scene", raw_data=text)
+
+
+def _draft_event(services: Services, changed: DraftChanged) -> ServerSentEvent:
+    if changed.draft is None:
+        return ServerSentEvent(event="draft", raw_data="null")
+    return ServerSentEvent(event="draft", data=DraftOut.of(changed.draft, services.objects.labels()))
+
+
+def _look(services: Services, look: Looking) -> LookEvent:
+    outlines = LookEvent.model_validate(services.outliner.outlines(look), from_attributes=True)
+    return outlines.model_copy(
+        update={"pictures": {name: _jpeg_url(encode_jpeg(image)) for name, image in look.rendered.items()}}
+    )
+
+
+def _jpeg_url(jpeg: bytes) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
+
+
+def _frame(taken: FramesTaken) -> FrameEvent:
+    urls = map(_jpeg_url, taken.jpegs)
+    return FrameEvent(scene=taken.scene, revision=taken.revision, cameras=dict(zip(taken.names, urls, strict=True)))

@@ -1,0 +1,495 @@
+"""Photos of tables, and of the board that calibrates the camera.
+
+Send a photo, mark objects in it, let them be found, make it a table or a goal. Places are pixels of the photo as
+`photo.jpg` shows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from starlette.concurrency import run_in_threadpool
+
+from app.api.bodies import JPEG, PNG, BoundedRoute, OpenFile, is_photo, kind_of, upload, whole_body
+from app.api.dependencies import Services, ServicesDep, slow
+from app.api.goals import GoalOut
+from app.api.jobs import JobOut
+from app.api.models import Box, DisplayName, Identifier, Input, Pixel, Seed
+from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
+from app.api.problems import named_in_path, problems
+from app.api.scenes import SceneOut, scene_out
+from app.jobs.job import Job
+from app.jobs.kinds.photos import sheet_name
+from app.processes.messages.photo_messages import CameraSource, Mark, Points, Stroke
+from app.storage.records import MarkedObject, TablePhoto
+from osfcore.geometry.workspace import TABLE_SIDE_M
+from osfcore.photo.board import Board, board_pdf
+from osfcore.photo.calibration import (
+    MOST_PHOTOS,
+    Calibration,
+    CalibrationJson,
+    Sighting,
+    board_place,
+    calibration_to_json,
+    known_camera,
+)
+from osfcore.photo.found_scene import FoundLight, FoundPose, FoundScene, TableSource
+
+
+class CameraIn(BaseModel):
+    """A calibrated camera, as a calibration tells it; what it says of its accuracy does not matter."""
+
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+    name: DisplayName
+    T_world_camera: list[list[FiniteFloat]] | None = None
+    K: list[list[FiniteFloat]]
+    width: int = Field(ge=1, le=100_000)
+    height: int = Field(ge=1, le=100_000)
+    radial: FiniteFloat = 0.0
+
+
+class SightingOut(BaseModel):
+    """The board in a photo."""
+
+    id: str = Field(description="Identifier; it is forgotten when the service ends.")
+    name: str
+    width: int = Field(description="Of the photo as it was sent [px].")
+    height: int = Field(description="[px]")
+    corners: list[list[float]] = Field(description="Of the board's squares [px].")
+
+    @staticmethod
+    def of(identifier: str, seen: Sighting) -> SightingOut:
+        """From the core's own."""
+        width, height = seen.size
+        corners = seen.points_px.round(2).tolist()
+        return SightingOut(id=identifier, name=seen.name, width=width, height=height, corners=corners)
+
+
+_OnTable = Annotated[float, Field(ge=-TABLE_SIDE_M / 2, le=TABLE_SIDE_M / 2)]
+
+
+class PlaceIn(Input):
+    """Where the board's centre lies on the table."""
+
+    x_m: _OnTable = 0.0
+    y_m: _OnTable = 0.0
+    turn_deg: float = Field(0.0, ge=-360, le=360, description="To the left, seen from above.")
+
+
+class CalibrateIn(Input):
+    """Photos of the board by one camera."""
+
+    photos: list[Identifier] = Field(max_length=MOST_PHOTOS)
+    table: Identifier | None = Field(None, description="The board lying on the table; tells where the camera stands.")
+    place: PlaceIn = Field(default_factory=lambda: PlaceIn(x_m=0.0, y_m=0.0, turn_deg=0.0))
+    name: DisplayName = Field("camera", description="Of the camera.")
+
+
+class AdviceOut(BaseModel):
+    """What to photograph next."""
+
+    words: str = Field(description="The end of a sentence.")
+    expected_error_mm: float = Field(description="Mean error on the table after that.")
+
+
+class CalibrationOut(BaseModel):
+    """What the photos tell so far."""
+
+    missing: str = Field(description="Why they do not suffice, a sentence; empty where they do.")
+    next: AdviceOut | None = Field(description="Null if nothing helps.")
+    camera: CalibrationJson = Field(description="As `osf photo estimate --camera` takes it, if nothing is missing.")
+
+    @staticmethod
+    def of(found: Calibration, name: str) -> CalibrationOut:
+        """From the core's own."""
+        camera = CalibrationJson.model_validate(calibration_to_json(found, name))
+        advice = found.advice
+        following = None if advice is None else AdviceOut(words=advice.words, expected_error_mm=1e3 * advice.mean_m)
+        return CalibrationOut(missing=found.missing, next=following, camera=camera)
+
+
+PointIn = Annotated[list[Pixel], Field(min_length=2, max_length=2)]
+Clicks = Annotated[list[PointIn], Field(max_length=50)]
+Focal = Annotated[FiniteFloat, Field(ge=1, le=100_000, description="Focal length in pixels of the photo as sent.")]
+
+
+class StrokeIn(Input):
+    """A line of the brush."""
+
+    adds: bool = Field(description="Whether what it covers belongs to the object; else it does not.")
+    radius: float = Field(ge=0.1, le=1000, allow_inf_nan=False, description="Of the brush [px].")
+    points: Annotated[list[PointIn], Field(min_length=1, max_length=500)]
+
+
+class MarkIn(Input):
+    """How a person points at an object: a box around it, and as many clicks and strokes as it takes."""
+
+    box: Box
+    on: Clicks = Field(default=[], description="Clicks on the object.")
+    off: Clicks = Field(default=[], description="Clicks beside it.")
+    strokes: list[StrokeIn] = Field(default=[], max_length=50)
+
+    def mark(self) -> Mark:
+        """Unchecked."""
+        strokes = tuple(Stroke(each.adds, each.radius, _points(each.points)) for each in self.strokes)
+        left, top, right, bottom = self.box
+        return Mark((left, top, right, bottom), _points(self.on), _points(self.off), strokes)
+
+
+class PhotoPatch(Input):
+    """Another focal length; null for what board or file tell. A calibrated camera counts instead of it."""
+
+    focal_px: Focal | None
+    camera: CameraIn | None = Field(None, description="`camera` of a calibration.")
+
+
+class FindIn(Input):
+    """How to look for what is marked."""
+
+    together: list[str] = Field(
+        default=[], max_length=8, description="Further photos of the same table; the board must be in view of all."
+    )
+    seed: Seed = 0
+
+
+class ChoiceIn(Input):
+    """Which of the poses of an object is right."""
+
+    choice: int = Field(ge=0, le=100, description="Number in `poses`.")
+
+
+class MakeTableIn(Input):
+    """What to make a table of a photo with."""
+
+    despite_doubts: bool = Field(False, description="Whether what was not found for certain counts all the same.")
+
+
+class MakeGoalIn(MakeTableIn):
+    """What to make a goal of a photo with."""
+
+    scene: Identifier | None = Field(
+        None,
+        description="That the goal is for; null for the one shown if it holds the photo's objects, else for a new one.",
+    )
+
+
+class PoseFound(FoundPose):
+    """One of the poses that explain the photo."""
+
+    picture: str | None = Field(
+        description="Path of its sheet: photo, outlines of mask and object, object; may be null."
+    )
+
+
+class ObjectFound(BaseModel):
+    """What was found of an object."""
+
+    poses: list[PoseFound] = Field(description="The most likely first.")
+    doubt: str = Field(description="Why it should not be trusted, a sentence; empty where it may be.")
+
+
+class MarkedOut(BaseModel):
+    """An object that was marked."""
+
+    name: str
+    label: str
+    box: list[float]
+    on: list[list[float]]
+    off: list[list[float]]
+    strokes: list[StrokeIn]
+    outline: list[list[list[float]]] = Field(description="Closed polygons around its mask and around holes in it.")
+    choice: int | None = Field(description="The pose that a person took; null before that.")
+    found: ObjectFound | None
+
+    @staticmethod
+    def of(marked: MarkedObject, label: str, found: ObjectFound | None) -> MarkedOut:
+        """From the service's own."""
+        mark = marked.mark
+        strokes = [StrokeIn(adds=s.adds, radius=s.radius, points=_lists(s.points)) for s in mark.strokes]
+        return MarkedOut(
+            name=marked.name, label=label, box=list(mark.box), on=_lists(mark.on), off=_lists(mark.off),
+            strokes=strokes, outline=[_lists(line) for line in marked.outline], choice=marked.choice, found=found,
+        )  # fmt: skip
+
+
+class PhotoFacts(BaseModel):
+    """A photo of a table."""
+
+    id: str
+    name: str
+    created_at: str = Field(description="UTC, ISO 8601.")
+    width: int = Field(description="[px]")
+    height: int = Field(description="[px]")
+    focal_px: float = Field(description="In pixels of the photo as it was sent.")
+    focal_source: CameraSource = Field(description="Who tells it: the board, the user, the file, or nobody.")
+    on_board: bool = Field(description="Whether the printed board is in view.")
+
+
+class TablePhotoOut(PhotoFacts):
+    """A photo of a table, with what is marked and what was found in it."""
+
+    notes: list[str] = Field(description="Sentences about photo, camera, table and light.")
+    objects: list[MarkedOut]
+    job: JobOut | None = Field(description="The search for what is marked now; null if there was none.")
+    table: TableSource | None = Field(description="What tells where the table is; null if nothing does, or not yet.")
+    light: FoundLight | None = Field(description="In the frame of the poses.")
+    doubts: list[str] = Field(description="Why nothing is made of it unless despite_doubts; empty where nothing is.")
+    scene: str | None = Field(description="The table that it became.")
+
+    @staticmethod
+    def of(
+        photo: TablePhoto, job: Job | None, found: FoundScene | None, doubts: Sequence[str], labels: dict[str, str]
+    ) -> TablePhotoOut:
+        """From the service's own."""
+        each = {} if found is None or job is None else {o.name: _found(job, found, o.name) for o in found.objects}
+        marked = [MarkedOut.of(one, labels.get(one.name, one.name), each.get(one.name)) for one in photo.objects]
+        return TablePhotoOut(
+            **facts_of(photo).model_dump(),
+            notes=list(photo.notes) if found is None else found.notes,
+            objects=marked,
+            job=None if job is None else JobOut.of(job),
+            table=None if found is None else found.table,
+            light=None if found is None else found.light,
+            doubts=list(doubts),
+            scene=photo.scene,
+        )
+
+
+class PhotoList(PageOut):
+    """Photos of tables, newest first."""
+
+    photos: list[PhotoFacts]
+    damaged: list[DamagedOut] = Field(description="What can only be deleted, on each page.")
+
+
+class TableMadeOut(BaseModel):
+    """A table that was made of a photo."""
+
+    scene: SceneOut
+    notes: list[str] = Field(description="Sentences about what does not lie as in the photo.")
+
+
+class GoalMadeOut(TableMadeOut):
+    """A goal that was made of a photo, and the table that it is for."""
+
+    goal: GoalOut
+
+
+def facts_of(photo: TablePhoto) -> PhotoFacts:
+    """What a list tells of a photo."""
+    return PhotoFacts(
+        id=photo.id,
+        name=photo.name,
+        created_at=photo.created_at,
+        width=photo.width,
+        height=photo.height,
+        focal_px=round(float(photo.K[0, 0]) * photo.sent_width / photo.width, 2),
+        focal_source=photo.source,
+        on_board=photo.T_world_camera is not None,
+    )
+
+
+def _found(job: Job, found: FoundScene, name: str) -> ObjectFound:
+    one = next(each for each in found.objects if each.name == name)
+    files = [sheet_name(name, number) for number in range(len(one.poses()))]
+    poses = [
+        PoseFound(**pose.model_dump(include=set(FoundPose.model_fields)), picture=_path(job, file))
+        for pose, file in zip(one.poses(), files, strict=True)
+    ]
+    return ObjectFound(poses=poses, doubt=one.doubt)
+
+
+def _path(job: Job, file: str) -> str | None:
+    return f"/api/jobs/{job.id}/files/{file}" if file in job.files else None
+
+
+def _points(points: list[list[float]]) -> Points:
+    return tuple((x, y) for x, y in points)
+
+
+def _lists(points: Points) -> list[list[float]]:
+    return [[x, y] for x, y in points]
+
+
+UPLOAD_PATH = "/api/photos"
+_PHOTO_BODY = upload("image/*", description="A photo.")
+router = APIRouter(prefix=UPLOAD_PATH, tags=["photos"], responses=problems(), route_class=BoundedRoute)
+ObjectPath = Annotated[Identifier, Path(description="Name of an object.", examples=["025_mug"])]
+
+
+PhotoPath = Annotated[str, Path(description="Identifier of a photo.")]
+
+
+def _known_photo(services: ServicesDep, photo: PhotoPath) -> TablePhoto:
+    with named_in_path():
+        return services.photos.get(photo)
+
+
+PhotoDep = Annotated[TablePhoto, Depends(_known_photo)]
+
+
+async def _photo_body(request: Request, max_bytes: int) -> bytes:
+    """The photo that is sent.
+
+    Raises:
+        HTTPException: if it is none, or the upload broke off.
+    """
+    if not is_photo(kind_of(request)):
+        raise HTTPException(415, "Send a photo, such as a JPEG or PNG file.")
+    return await whole_body(request, max_bytes)
+
+
+@router.post("", status_code=201, responses=problems(409, 415, 503, 507), openapi_extra=_PHOTO_BODY)
+async def create(
+    services: ServicesDep,
+    request: Request,
+    response: Response,
+    name: Annotated[DisplayName, Query(description="For people.")] = "Photo",
+    focal_px: Annotated[
+        float | None, Query(ge=1, le=100_000, description="Focal length in pixels, if it is known.")
+    ] = None,
+) -> TablePhotoOut:
+    """Keep a photo of a table, of any size and usual format; its camera is found if the printed board is in view."""
+    data = await _photo_body(request, services.settings.max_photo_bytes)
+    photo = await run_in_threadpool(services.photos.receive, data, name, focal_px)
+    response.headers["Location"] = f"{UPLOAD_PATH}/{photo.id}"
+    return _out(services, photo)
+
+
+@router.get("")
+def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> PhotoList:
+    """List photos of tables, newest first."""
+    shown, total, following = page(services.photos.all(), limit, after, newest_first=True)
+    damaged = [DamagedOut(id=each.id, reason=each.reason) for each in services.photos.damaged()]
+    return PhotoList(photos=[facts_of(photo) for photo in shown], damaged=damaged, total=total, next=following)
+
+
+@router.get("/board.pdf", response_class=Response, responses={200: {"content": {"application/pdf": {}}}})
+def board() -> Response:
+    """The board to print, an A4 page; laid on the table it tells where the camera was."""
+    return Response(board_pdf(Board()), media_type="application/pdf")
+
+
+@router.get("/{photo}", responses=problems(404, 409))
+def get(services: ServicesDep, photo: PhotoDep) -> TablePhotoOut:
+    """Tell what is marked in a photo, and what was found."""
+    return _out(services, photo)
+
+
+@router.patch("/{photo}", responses=problems(404, 409, 503, 507))
+@slow
+def set_camera(services: ServicesDep, photo: PhotoDep, body: PhotoPatch) -> TablePhotoOut:
+    """Give a photo another focal length, or the calibrated camera that took it."""
+    camera = None if body.camera is None else known_camera(body.camera.model_dump())
+    return _out(services, services.photos.set_camera(photo.id, body.focal_px, camera))
+
+
+@router.delete("/{photo}", status_code=204, responses=problems(404, 507))
+def remove(services: ServicesDep, photo: PhotoPath) -> None:
+    """Delete a photo, damaged or not; tables and goals that were made of it stay."""
+    with named_in_path():
+        services.photos.remove(photo)
+
+
+@router.put("/{photo}/objects/{name}", responses=problems(404, 409, 503, 507))
+@slow
+def mark(services: ServicesDep, photo: PhotoDep, name: ObjectPath, body: MarkIn) -> TablePhotoOut:
+    """Point at an object, or anew; its mask is found."""
+    with named_in_path():
+        return _out(services, services.photos.mark(photo.id, name, body.mark()))
+
+
+@router.delete("/{photo}/objects/{name}", responses=problems(404, 409, 507))
+@slow
+def unmark(services: ServicesDep, photo: PhotoDep, name: ObjectPath) -> TablePhotoOut:
+    """Forget what was marked of an object."""
+    with named_in_path():
+        return _out(services, services.photos.unmark(photo.id, name))
+
+
+@router.post("/{photo}/objects/{name}/choice", responses=problems(404, 409, 507))
+@slow
+def choose(services: ServicesDep, photo: PhotoDep, name: ObjectPath, body: ChoiceIn) -> TablePhotoOut:
+    """Take one of the poses that were found of an object."""
+    with named_in_path():
+        return _out(services, services.photos.choose(photo.id, name, body.choice))
+
+
+@router.post("/{photo}/find", status_code=202, responses=problems(404, 409, 429, 507))
+@slow
+def find(services: ServicesDep, photo: PhotoDep, body: FindIn) -> TablePhotoOut:
+    """Find the marked objects and the lamp; `job` tells how far that is."""
+    return _out(services, services.photos.find(photo.id, body.together, body.seed))
+
+
+@router.post("/{photo}/table", status_code=201, responses=problems(404, 409, 503, 507))
+@slow
+def make_table(services: ServicesDep, photo: PhotoDep, body: MakeTableIn) -> TableMadeOut:
+    """Make a table whose objects lie as in the photo, under its lamp, and show it."""
+    made = services.photo_tables.make_table(photo.id, despite_doubts=body.despite_doubts)
+    return TableMadeOut(scene=scene_out(services, made.scene), notes=list(made.notes))
+
+
+@router.post("/{photo}/goal", status_code=201, responses=problems(404, 409, 503, 507))
+@slow
+def make_goal(services: ServicesDep, photo: PhotoDep, body: MakeGoalIn) -> GoalMadeOut:
+    """Make a goal in which objects lie as in the photo."""
+    made = services.photo_tables.make_goal(photo.id, body.scene, despite_doubts=body.despite_doubts)
+    scene = scene_out(services, made.scene)
+    return GoalMadeOut(scene=scene, notes=list(made.notes), goal=GoalOut.of(made.goal))
+
+
+@router.get("/{photo}/photo.jpg", response_class=Response, responses={**problems(404, 409), **JPEG})
+def picture(services: ServicesDep, photo: PhotoDep) -> OpenFile:
+    """Show a photo, upright, no side longer than 2048 px."""
+    return OpenFile(services.photos.picture(photo.id), f"{photo.name} has been deleted.", media_type="image/jpeg")
+
+
+@router.get("/{photo}/objects/{name}/mask.png", response_class=Response, responses={**problems(404, 409), **PNG})
+def mask(services: ServicesDep, photo: PhotoDep, name: ObjectPath) -> OpenFile:
+    """Show the mask of a marked object."""
+    with named_in_path():
+        photo.marked(name)
+    return OpenFile(services.photos.mask(photo.id, name), f"{name} is not marked.", media_type="image/png")
+
+
+@router.get("/{photo}/drawing.png", response_class=Response, responses={**problems(404, 409, 503), **PNG})
+@slow
+def drawing(services: ServicesDep, photo: PhotoDep) -> Response:
+    """Show how the scene that was found looks from the photo's camera, with its shadows."""
+    png = services.photo_tables.drawing(photo.id)
+    return Response(png, media_type="image/png", headers={"Cache-Control": "no-store"})
+
+
+def _out(services: Services, photo: TablePhoto) -> TablePhotoOut:
+    job = services.photos.job(photo)
+    found = services.photos.found(photo) if job is not None and job.state == "done" else None
+    doubts = () if found is None else services.photos.doubts(photo, found)
+    return TablePhotoOut.of(photo, job, found, doubts, services.objects.labels())
+
+
+CALIBRATION_UPLOAD_PATH = "/api/calibration/photos"
+calibration_router = APIRouter(
+    prefix="/api/calibration", tags=["photos"], responses=problems(), route_class=BoundedRoute
+)
+
+
+@calibration_router.post("/photos", responses=problems(415, 503), openapi_extra=_PHOTO_BODY)
+async def sight(
+    services: ServicesDep, request: Request, name: Annotated[DisplayName, Query(description="For people.")] = "Photo"
+) -> SightingOut:
+    """Look for the printed board in a photo; the photo itself is not kept."""
+    data = await _photo_body(request, services.settings.max_photo_bytes)
+    return SightingOut.of(*await run_in_threadpool(services.board_photos.add, data, name))
+
+
+@calibration_router.post("", responses=problems(503))
+@slow
+def assess(services: ServicesDep, body: CalibrateIn) -> CalibrationOut:
+    """Tell what photos of the board tell of the camera so far, what is missing and what helps most."""
+    place = board_place(body.place.x_m, body.place.y_m, body.place.turn_deg)
+    return CalibrationOut.of(services.board_photos.assess(body.photos, body.table, place), body.name)

@@ -1,0 +1,166 @@
+"""What would a push do? Answered at once, for many pushes at a time."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import json
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Response
+from pydantic import BaseModel, ConfigDict, FailFast, Field
+
+from app.api.bodies import BoundedRoute
+from app.api.dependencies import ServicesDep
+from app.api.models import Input, LightIn, ObjectName, Position, Quaternion, Vector3, Velocity
+from app.api.problems import problems
+from app.processes.messages.neural_messages import Predicted
+from app.processes.messages.scene_messages import SceneRecord
+from osfcore.errors import InvalidInput, UnknownName
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.rollouts import MAX_HORIZON, check_actions
+from osfcore.geometry.states import MAX_OBJECTS, SceneState
+from osfcore.io.scene_file import rollouts_to_json
+from osfcore.paper.method import Method
+
+_OVERHEAD = (0.0, 0.0, 1.0)
+Sequence = Annotated[list[Velocity], Field(min_length=1, max_length=MAX_HORIZON), FailFast()]
+_STATE_EXAMPLE = {
+    "objects": [{"name": "006_mustard_bottle", "position": [0.0, 0.0, 0.095], "quaternion": [1.0, 0.0, 0.0, 0.0]}],
+    "light": {"position": [0.3, -0.4, 0.8]},
+    "pusher": {"position": [-0.12, 0.0, 0.062]},
+}
+
+
+class Told(BaseModel):
+    """Part of a file or answer that tells more than is needed here; the rest is left alone."""
+
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+
+class PlacedObject(Told):
+    """Where one object is."""
+
+    name: ObjectName
+    position: Position
+    quaternion: Quaternion
+
+
+class Place(Told):
+    """A place in the world."""
+
+    position: Position
+
+
+class StateIn(Told):
+    """Where everything is: what scene.json, state.json and /api/scenes tell can be sent as it is."""
+
+    objects: list[PlacedObject] = Field(min_length=1, max_length=MAX_OBJECTS)
+    light: Place | None = Field(None, description="Pushes do not depend on it.")
+    pusher: Place | None = Field(None, description="Centre of the pusher; a prediction needs one.")
+
+    def state(self) -> SceneState:
+        """The core's state; raises InvalidInput if it makes no sense."""
+        poses = Pose(
+            np.array([placed.position for placed in self.objects], float),
+            np.array([placed.quaternion for placed in self.objects], float),
+        )
+        light = Light(np.array(_OVERHEAD)) if self.light is None else LightIn(position=self.light.position).light()
+        pusher = None if self.pusher is None else np.array(self.pusher.position)
+        return SceneState(tuple(placed.name for placed in self.objects), poses, light, pusher)
+
+
+class PredictionIn(Input):
+    """Sequences of actions to try, and from where."""
+
+    actions: list[Sequence] = Field(
+        min_length=1,
+        max_length=1000,
+        description="K sequences of T velocities of the pusher (vx, vy, 0) [m/s], each held for 0.2 s.",
+        examples=[[[[0.3, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.0, 0.0]]]],
+    )
+    state: StateIn | None = Field(
+        None, description="Null for the scene that is shown, with its true poses.", examples=[_STATE_EXAMPLE]
+    )
+    before: StateIn | None = Field(
+        None, description="The same objects 0.2 s ago, with a state in which something may still be moving."
+    )
+    method: Method = Field(
+        "ours", description='Whose model: "ours", or "paper", the graph network as published, which knows no "before".'
+    )
+
+
+class PredictionOut(BaseModel):
+    """The futures; exactly as rollouts.json holds them, and more."""
+
+    names: list[str] = Field(description="Of the N objects.")
+    positions: list[list[list[Vector3]]] = Field(
+        description="K x (T+1) x N x 3: before the first and after each action [m]."
+    )
+    quaternions: list[list[list[Quaternion]]] = Field(description="K x (T+1) x N x 4, (w, x, y, z).")
+    pusher: list[list[Vector3]] = Field(description="Its centre, K x (T+1) x 3 [m]; it stops at the end of its reach.")
+    step_s: float = Field(description="Time between two of them [s].")
+    took_s: float = Field(description="Time that predicting took, without waiting and without loading [s].")
+    scene: str | None = Field(description="Identifier of the scene from which it starts; null for a sent state.")
+    revision: int | None = Field(description="Of that scene; once it has grown, the prediction is outdated.")
+
+
+MAX_POSES = 100_000  # some 8 MB of JSON
+_ANSWER: dict[int | str, dict[str, Any]] = {200: {"model": PredictionOut, "description": "The predicted futures."}}
+router = APIRouter(prefix="/api/predictions", tags=["predictions"], route_class=BoundedRoute)
+
+
+@router.post("", response_class=Response, responses={**problems(409, 503), **_ANSWER})
+async def predict(services: ServicesDep, body: PredictionIn) -> Response:
+    """Predict what sequences of pushes would do, in the scene that is shown or in a state that is sent.
+
+    Open loop, from a network that has learned from pushes; nothing moves in the simulation. The first time, this waits
+    for the network to load.
+    """
+    before = None if body.before is None else body.before.state()
+    if before is not None and body.state is None:
+        raise InvalidInput("state", "missing", "given together with what was before")
+    if before is not None and body.method == "paper":
+        raise InvalidInput("before", "given", "left out with the method as published, which has no velocities")
+    record, state = (services.predictions.current(), None) if body.state is None else (None, body.state.state())
+    if state is None:
+        assert record is not None
+        state = record.state
+    else:
+        _check_known(state, services.fields.names())
+    actions = await asyncio.to_thread(_actions, body, len(state.names))
+    order = functools.partial(services.predictions.submit, state, actions, before=before, method=body.method)
+    answer = await asyncio.wrap_future(await asyncio.to_thread(order))
+    assert isinstance(answer, Predicted)  # nothing overtakes an order with a key of its own
+    content = await asyncio.to_thread(_json, answer, record)
+    return Response(content, media_type="application/json")
+
+
+def _actions(body: PredictionIn, objects: int) -> np.ndarray:
+    lengths = {len(sequence) for sequence in body.actions}
+    if len(lengths) > 1:
+        raise InvalidInput("lengths of the sequences", sorted(lengths)[:5], "the same for all")
+    actions = check_actions(body.actions)
+    poses = len(actions) * (actions.shape[1] + 1) * objects
+    if poses > MAX_POSES:
+        raise InvalidInput("number of poses in the answer, K x (T+1) x N,", poses, f"at most {MAX_POSES}")
+    return actions
+
+
+def _check_known(state: SceneState, known: tuple[str, ...]) -> None:
+    """What is sent names objects as it likes; what is on the table is a matter of the present state (409)."""
+    for name in state.names:
+        if name not in known:
+            raise UnknownName("object with a field", name, known)
+
+
+def _json(answer: Predicted, record: SceneRecord | None) -> bytes:
+    body = {
+        **rollouts_to_json(answer.rollouts),
+        "took_s": round(answer.took_s, 6),
+        "scene": None if record is None else record.id,
+        "revision": None if record is None else record.revision,
+    }
+    return json.dumps(body, allow_nan=False, separators=(",", ":")).encode()

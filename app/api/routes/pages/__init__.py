@@ -1,1 +1,0 @@
-"""Routes that pages need, more than programs do."""
