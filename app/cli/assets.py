@@ -1,0 +1,136 @@
+"""`osf assets`: list, fetch and add objects."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from app.cli.command import DataCommand, follow, show_table
+from app.cli.workers import worker_pool
+from osfcore.errors import OsfError
+
+if TYPE_CHECKING:
+    from osfcore.objects.asset_library import AssetLibrary
+
+
+@dataclass(frozen=True)
+class AssetsList(DataCommand):
+    """List the objects that are known, and which of them are on this machine."""
+
+    def run(self) -> dict[str, Any]:
+        """Show the table; return its rows."""
+        from osfcore.objects.catalogue import CATALOGUE
+
+        library, rows = self.assets, []
+        for name in sorted({*CATALOGUE, *library.names()}):
+            try:
+                rows.append(_row(library, name))
+            except OsfError as error:  # a damaged object must not hide the others
+                print(f"osf: {error}", file=sys.stderr)
+        if not self.json:
+            cells = [
+                (row["name"], row["label"], _size_text(row["size_m"]), f"{row['mass_kg']:.3f}", row["symmetry"],
+                 "yes" if row["available"] else "no", row["licence"])
+                for row in rows
+            ]  # fmt: skip
+            titles = ("name", "label", "cm", "kg", "symmetry", "here", "licence")
+            show_table(cells, titles, left={*titles} - {"cm", "kg"})
+        return {"objects": rows, "data_dir": str(self.data_dir)}
+
+
+@dataclass(frozen=True)
+class AssetsFetch(DataCommand):
+    """Fetch objects of the catalogue and make them ready: texture, collision parts, resting orientations."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Objects such as 006_mustard_bottle; none: all that the source offers."""
+    source: str = "pypi"
+    """"pypi" (ten objects), a folder with NAME/google_16k/textured.obj, or the http(s) address of such a folder or of
+    the archives NAME_google_16k.tgz."""
+    workers: int = 2
+    """Processes that convert meshes; 1 converts in this one."""
+    force: bool = False
+    """Fetch also what is here already."""
+
+    def run(self) -> dict[str, Any]:
+        """Fetch with a progress bar; return what is there now."""
+        from osfcore.objects.fetch import fetch, source_from
+
+        library = self.assets
+        source = source_from(self.source, self.data_dir / "cache")
+        chosen = self.names or source.names()
+        is_work = any(self.force or not library.has(name) for name in chosen)
+        with worker_pool(self.workers if is_work else 1) as executor:
+            if executor is not None:  # while this one downloads, so that the first episode need not wait for compilers
+                executor.submit(_compile)
+            follow(fetch(chosen, source, library, executor, force=self.force))
+        return {"objects": list(chosen), "available": list(library.names()), "data_dir": str(self.data_dir)}
+
+
+@dataclass(frozen=True)
+class AssetsAdd(DataCommand):
+    """Add an object of your own from a textured mesh."""
+
+    mesh: Annotated[Path, tyro.conf.Positional]
+    """OBJ, GLB or PLY file, in metres."""
+    name: str
+    """What scenes call it: lower-case letters, digits, '_' and '-'."""
+    mass: float
+    """Mass [kg]."""
+    label: str = ""
+    """Name for a person; made from the name if not given."""
+    scale: float = 1.0
+    """Metres for one unit of the file, such as 0.001 for millimetres."""
+    licence: str = "unknown"
+    """Licence of the mesh."""
+    force: bool = False
+    """Replace an object of that name."""
+
+    def run(self) -> dict[str, Any]:
+        """Convert and store the mesh; return its facts."""
+        from osfcore.objects.fetch import NewObject, add_object
+
+        library = self.assets
+        new = NewObject(self.name, self.mass, self.label, self.scale, self.licence)
+        asset = add_object(self.mesh, new, library, force=self.force)
+        row = {**_row(library, self.name), "collision_parts": len(asset.parts)}
+        size = _size_text(row["size_m"])
+        self.say(f"Added {self.name}: {size} cm, {self.mass:g} kg, {len(asset.parts)} collision parts.")
+        return row
+
+
+Assets = Annotated[
+    Annotated[AssetsList, tyro.conf.subcommand("list")]
+    | Annotated[AssetsFetch, tyro.conf.subcommand("fetch")]
+    | Annotated[AssetsAdd, tyro.conf.subcommand("add")],
+    tyro.conf.OmitSubcommandPrefixes,
+]
+
+
+def _compile() -> None:
+    from app.jobs.kinds.rehearsal import rehearse
+
+    rehearse()
+
+
+def _row(library: AssetLibrary, name: str) -> dict[str, Any]:
+    info, available = library.info(name), library.has(name)
+    return {
+        "name": name,
+        "label": info.label,
+        "size_m": [float(side) for side in library.size_m(name)] if available else None,
+        "mass_kg": info.mass_kg,
+        "symmetry": info.symmetry.kind,
+        "symmetry_reason": info.symmetry.reason,
+        "available": available,
+        "licence": info.licence,
+        "attribution": info.attribution,
+    }
+
+
+def _size_text(size_m: list[float] | None) -> str:
+    return " x ".join(f"{100 * side:.0f}" for side in size_m) if size_m else ""

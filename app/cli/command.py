@@ -1,0 +1,175 @@
+"""What the commands share: their options and libraries, the progress bar, and where results may be written."""
+
+from __future__ import annotations
+
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
+
+import tyro
+
+from app.storage.paths import default_data_dir
+from osfcore.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from osfcore.fields.field_library import FieldLibrary
+    from osfcore.objects.asset_library import AssetLibrary
+
+T = TypeVar("T")
+Flat = Annotated[T, tyro.conf.arg(name="")]  # settings of the core whose fields are options of the command itself
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command(ABC):
+    """A command: its fields are the options."""
+
+    json: bool = False
+    """Print the result as one JSON object in the last line."""
+
+    @abstractmethod
+    def run(self) -> dict[str, Any]:
+        """Do it; return what `--json` prints."""
+
+    def say(self, *sentences: str) -> None:
+        """Print sentences for people, at once, a line each; with `--json` nothing."""
+        if not self.json:
+            print(*sentences, sep="\n", flush=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataCommand(Command):
+    """A command that needs what this machine keeps: objects, fields, networks."""
+
+    data_dir: Path = field(default_factory=default_data_dir)
+    """Folder for everything that osf keeps: objects, fields, networks (also: OSF_DATA_DIR)."""
+
+    @property
+    def assets(self) -> AssetLibrary:
+        """The objects that were fetched or added."""
+        from osfcore.objects.asset_library import AssetLibrary
+
+        return AssetLibrary(self.data_dir / "objects")
+
+    @property
+    def trained(self) -> FieldLibrary:
+        """The fields that were trained on this machine, and those that come with the program."""
+        from osfcore.fields.field_library import FieldLibrary
+
+        return FieldLibrary(self.data_dir)
+
+
+def check_out(out: Path, *suffixes: str) -> str:
+    """Refuse a file that cannot be written before the work begins; return which of the suffixes it has.
+
+    Raises:
+        InvalidInput: if it has none of them.
+        CannotWrite: if nothing can be written there.
+    """
+    from osfcore.io.output_paths import check_place
+
+    suffix = out.suffix.lower()
+    if suffix not in suffixes:
+        raise InvalidInput("output file", out, f"a path that ends in {' or '.join(suffixes)}")
+    check_place(out)
+    return suffix
+
+
+class Step(Protocol):
+    """How far a piece of work is; `osfcore.progress.Progress` and richer steps fit."""
+
+    @property
+    def done(self) -> int:
+        """Units finished."""
+        ...
+
+    @property
+    def total(self) -> int:
+        """Units in all."""
+        ...
+
+    @property
+    def note(self) -> str:
+        """What is being done."""
+        ...
+
+
+class StepWithProgress(Protocol):
+    """A step of a kind that keeps its progress in a field."""
+
+    @property
+    def progress(self) -> Step:
+        """How far the work is."""
+        ...
+
+
+StepT = TypeVar("StepT", bound=Step | StepWithProgress)
+
+
+def follow(steps: Iterable[StepT]) -> StepT | None:
+    """Run through the steps and show them: as a bar with the time left on a terminal, else as a line now and then.
+
+    Returns:
+        The last step, or None if there was none.
+    """
+    return _follow_with_bar(steps) if sys.stderr.isatty() else _follow_with_lines(steps)
+
+
+def report_of(steps: Iterable[Any]) -> Any:  # noqa: ANN401  each kind of work has reports of its own
+    """Run through the steps with a progress bar; return the report that the last one brings."""
+    last = follow(steps)
+    assert last is not None
+    assert last.report is not None, "the last step brings the report"
+    return last.report
+
+
+def _progress(step: Step | StepWithProgress) -> Step:
+    return getattr(step, "progress", step)
+
+
+def _follow_with_bar(steps: Iterable[StepT]) -> StepT | None:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    last = None
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}", markup=False))
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("", total=None)
+        for last in steps:
+            now = _progress(last)
+            bar.update(task, completed=now.done, total=now.total, description=now.note)
+    return last
+
+
+def _follow_with_lines(steps: Iterable[StepT]) -> StepT | None:
+    last, shown, percent_shown = None, "", -1
+    for last in steps:
+        now = _progress(last)
+        activity = now.note.split("(")[0]  # what follows in brackets counts up: a log needs no line for each
+        percent = 100 * now.done // max(now.total, 1)
+        if activity != shown or percent >= percent_shown + 5:
+            print(f"[{percent:3d} %] {now.note}", file=sys.stderr, flush=True)
+            shown, percent_shown = activity, percent
+    return last
+
+
+def show_table(rows: Iterable[Iterable[str]], titles: Iterable[str], left: Iterable[str] = ()) -> None:
+    """Print a table without lines, for people.
+
+    Args:
+        rows: cells of each.
+        titles: of the columns.
+        left: titles of those that are not aligned at the right.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for title in titles:
+        table.add_column(title, justify="left" if title in left else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    Console().print(table)

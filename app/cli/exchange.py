@@ -1,0 +1,255 @@
+"""`osf export`, `osf import` and `osf check`: files for other programs, data of others, and checks of files."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from app.cli.command import Command, DataCommand, check_out
+from osfcore.errors import CorruptFile, InvalidInput, OsfError
+
+if TYPE_CHECKING:
+    from osfcore.fields.kiloosf import KiloOSF
+    from osfcore.geometry.light import Light
+
+POSES_FILE = "poses.json"
+
+
+@dataclass(frozen=True)
+class ExportScene(DataCommand):
+    """A scene as GLB or USDZ for Blender, game engines and browsers: objects, table, pusher, cameras, and the light."""
+
+    scene: Path
+    """scene.json, or the state.json of an estimate."""
+    out: Path
+    """.glb or .usdz to write."""
+    fields: bool = False
+    """Objects as the surfaces of their fields, also where this machine has their meshes."""
+
+    def run(self) -> dict[str, Any]:
+        """Export; the result tells which objects are meshes and which are surfaces of fields."""
+        from osfcore.io.scene_file import read_scene
+
+        suffix = check_out(self.out, ".glb", ".usdz")
+        if suffix == ".glb":
+            from osfcore.contrib.export.meshes import scene_glb as export
+        else:
+            from osfcore.contrib.export.usd import scene_usdz as export
+        scene = read_scene(self.scene)
+        library, fields = self.assets, self.trained
+        scanned = [name for name in scene.state.names if library.has(name) and not self.fields]
+        shapes = {n: library.load(n).mesh if n in scanned else fields.load(n) for n in scene.state.names}
+        size = _write(self.out, lambda: export(scene, shapes, fields.load_table()))
+        others = [name for name in scene.state.names if name not in scanned]
+        x, y, z = scene.state.light.direction
+        self.say(f"Wrote {self.out}, {size / 1e6:.1f} MB; light toward ({x:.3f}, {y:.3f}, {z:.3f}).")
+        if others:
+            self.say(f"Surfaces of fields, with their albedo: {', '.join(others)}.")
+        return {"out": str(self.out), "bytes": size, "meshes": scanned, "fields": others}
+
+
+@dataclass(frozen=True)
+class ExportField(DataCommand):
+    """The surface of a field as GLB or USD, with a colour for each vertex."""
+
+    name: tyro.conf.Positional[str]
+    """Name of an object that has a field, such as 006_mustard_bottle, or a .safetensors file."""
+    out: Path
+    """.glb, .usdz or .usdc to write."""
+    light: tuple[float, float, float] | None = None
+    """Direction toward a light whose shading is baked into the colours; without it they are the albedo."""
+
+    def run(self) -> dict[str, Any]:
+        """Export; the result tells what the colours are."""
+        suffix = check_out(self.out, ".glb", ".usdz", ".usdc")
+        if suffix == ".glb":
+            from osfcore.contrib.export.meshes import field_glb as export
+        else:
+            from osfcore.contrib.export.usd import field_usd
+
+            export = partial(field_usd, is_packed=suffix == ".usdz")
+        light, shape = None if self.light is None else _light(self.light), _field(self.name, self.data_dir)
+        size = _write(self.out, lambda: export(shape, Path(self.name).stem, light))
+        colours = "the albedo" if light is None else f"those under the light toward {self.light}, baked in"
+        self.say(f"Wrote {self.out}, {size / 1e6:.1f} MB; its colours are {colours}.")
+        return {"out": str(self.out), "bytes": size, "colours": "albedo" if light is None else "baked"}
+
+
+@dataclass(frozen=True)
+class ExportSplats(DataCommand):
+    """A field as 3D Gaussian splats (PLY). The lighting is baked in: splats cannot be lit anew."""
+
+    name: tyro.conf.Positional[str]
+    """Name of an object that has a field, such as 006_mustard_bottle, or a .safetensors file."""
+    out: Path
+    """PLY to write."""
+    light: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction toward the light that is baked in, in the object's frame; from straight above by default."""
+
+    def run(self) -> dict[str, Any]:
+        """Export; the result tells how many Gaussians there are."""
+        from osfcore.contrib.export.splats import field_splats, splats_ply
+
+        check_out(self.out, ".ply")
+        splats = field_splats(_field(self.name, self.data_dir), _light(self.light))
+        size, count = _write(self.out, lambda: splats_ply(splats)), len(splats.means)
+        self.say(f"Wrote {self.out}, {count} Gaussians; lighting baked in, light toward {self.light}.")
+        return {"out": str(self.out), "bytes": size, "splats": count, "light": splats.light.direction.tolist()}
+
+
+def _light(direction: tuple[float, float, float]) -> Light:
+    import numpy as np
+
+    from osfcore.geometry.light import Light
+
+    return Light(np.array(direction))
+
+
+def _field(name: str, data_dir: Path) -> KiloOSF:
+    from osfcore.fields.field_library import FieldLibrary
+    from osfcore.fields.kiloosf import read_field
+
+    return read_field(Path(name)) if name.endswith(".safetensors") else FieldLibrary(data_dir).load(name)
+
+
+def _write(out: Path, made: Callable[[], bytes]) -> int:
+    from osfcore.io.files import write_atomically
+
+    data = made()
+    write_atomically(out, data)
+    return len(data)
+
+
+@dataclass(frozen=True)
+class ExportPoses(Command):
+    """Estimated poses as the CSV that BOP's toolkit evaluates: every object in every image of a scene."""
+
+    state: Path
+    """state.json of the estimate."""
+    observation: Path
+    """Folder that 'osf import bop' wrote: its cameras are the images of the scene."""
+    scene: int
+    """Number of the scene in BOP's data set."""
+    out: Path
+    """CSV to write."""
+    models: Path | None = None
+    """Folder with models_info.json, where the models are not those of BOP's YCB-V, which are centred."""
+    seconds: float = -1.0
+    """Time that the estimation took [s]; -1 if it is not known."""
+
+    def run(self) -> dict[str, Any]:
+        """Export; the result tells how many poses there are."""
+        from osfcore.contrib.bop import bop_results
+        from osfcore.io.files import write_atomically
+        from osfcore.io.observation_file import read_observation
+        from osfcore.io.scene_file import read_estimated
+
+        check_out(self.out, ".csv")
+        estimate, cameras = read_estimated(self.state), read_observation(self.observation).cameras
+        write_atomically(self.out, bop_results(estimate, cameras, self.scene, self.models, self.seconds).encode())
+        count = len(cameras) * len(estimate.state.names)
+        self.say(f"Wrote {self.out}: {count} poses in {len(cameras)} images of scene {self.scene}.")
+        return {"out": str(self.out), "scene": self.scene, "images": len(cameras), "poses": count}
+
+
+Export = Annotated[
+    Annotated[ExportScene, tyro.conf.subcommand("scene")]
+    | Annotated[ExportField, tyro.conf.subcommand("field")]
+    | Annotated[ExportSplats, tyro.conf.subcommand("splats")]
+    | Annotated[ExportPoses, tyro.conf.subcommand("bop")],
+    tyro.conf.OmitSubcommandPrefixes,
+]
+
+
+@dataclass(frozen=True)
+class Import(DataCommand):
+    """A scene of a BOP data set with YCB-V's objects as an observation folder, for 'osf estimate'."""
+
+    kind: tyro.conf.Positional[Literal["bop"]]
+    """What is imported."""
+    scene: tyro.conf.Positional[Path]
+    """Folder of the scene: scene_camera.json, scene_gt.json, rgb, mask_visib."""
+    out: Path
+    """Folder to write; must be new or empty. poses.json in it tells the annotated poses in the world."""
+    images: tuple[int, ...] | None = None
+    """Numbers of the images; by default all, or 32 spread over them."""
+    names: tuple[str, ...] | None = None
+    """Objects to keep; by default all that have a field, of which there may be 8."""
+    table: Literal["world", "objects"] = "world"
+    """Where the table is: BOP's world is its frame (z up, table at z = 0), or where most objects would stand."""
+    encoding: Literal["srgb", "linear"] = "srgb"
+    """What values of the pictures mean: sRGB, as cameras write; linear radiance, as in renderings from here."""
+    models: Path | None = None
+    """Folder with models_info.json, where the models are not those of BOP's YCB-V, which are centred."""
+
+    def run(self) -> dict[str, Any]:
+        """Import; the result tells images and objects, and which objects were left out."""
+        from osfcore.contrib.bop import BopChoice, read_bop_scene
+        from osfcore.io.files import folder_at_once, write_json
+        from osfcore.io.observation_file import write_observation
+
+        out = self.out.absolute()
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InvalidInput("output folder", self.out, "new or empty")
+        choice = BopChoice(self.images, self.encoding, self.models)
+        prior = self._prior if self.table == "objects" else None
+        scene = read_bop_scene(self.scene, choice, self.names, prior, self.trained.names())
+        poses = {
+            name: {"position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
+            for name, pose in scene.poses.items()
+        }
+        with folder_at_once(out) as partial:
+            write_json(partial / POSES_FILE, poses)
+            write_observation(partial, scene.observation)
+        images = [camera.name for camera in scene.observation.cameras]
+        names = list(scene.observation.names)
+        self.say(f"Wrote {self.out}: images {', '.join(images)} of {', '.join(names)}.")
+        if self.names is None and scene.left_out:
+            self.say(f"Left out, as there are no fields of them: {', '.join(scene.left_out)}.")
+        left_out = list(scene.left_out)
+        return {"out": str(self.out), "images": [int(i) for i in images], "objects": names, "left_out": left_out}
+
+    def _prior(self, name: str) -> Any:  # noqa: ANN401  TablePrior, which the start of the command line must not load
+        from osfcore.estimation.objective import resting_orientations
+        from osfcore.photo.pose_loss import TablePrior
+
+        return TablePrior(resting_orientations(self.trained.load(name)))
+
+
+@dataclass(frozen=True)
+class Check(Command):
+    """Validate a scene, state, push file, field, results of BOP, or a folder: observation, image set, scene of BOP."""
+
+    path: tyro.conf.Positional[Path]
+    """File or folder to check; an image set may be zipped."""
+    overlay: Path | None = None
+    """For an image set: PNG to write, with axes, light and the silhouettes' box drawn into some of its images; for an
+    observation with axes, workspace and masks; for a scene of BOP with masks and the annotated objects' axes."""
+
+    def run(self) -> dict[str, Any]:
+        """Check; the result tells what it is and how much is in it."""
+        from osfcore.inspection.check import check_overlay_place, check_path, draw_overlay
+
+        if self.overlay is not None:
+            check_overlay_place(self.overlay)
+        if not self.path.exists():
+            raise CorruptFile(self.path, "there is no such file or folder")
+        try:
+            report = check_path(self.path)
+        except CorruptFile:
+            if self.overlay is not None:
+                # What contradicts itself is best seen; what cannot even be drawn was told already.
+                with contextlib.suppress(OsfError):
+                    draw_overlay(self.path, self.overlay)
+                    self.say(f"{self.overlay} shows how cameras, light and silhouettes were understood.")
+            raise
+        if self.overlay is not None:
+            draw_overlay(self.path, self.overlay)
+        self.say(f"{self.path} is a good {report.kind}: {report.summary}.")
+        return {"path": str(self.path), "kind": report.kind, **report.facts}

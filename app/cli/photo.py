@@ -1,0 +1,290 @@
+"""`osf photo`: a board to print, a camera calibrated with it, and objects and lamp in a photograph."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from app.cli.command import Command, DataCommand, check_out, follow
+from osfcore.errors import InvalidInput, UnknownName, shown
+from osfcore.photo.calibration import Calibration, KnownCamera, read_camera
+from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
+from osfcore.photo.segmentation import Box, propose_mask
+
+if TYPE_CHECKING:
+    from osfcore.geometry.poses import Pose
+    from osfcore.photo.photograph import Photograph
+    from osfcore.photo.poses import PhotoModels, PhotoStep
+
+_FORM = "[PHOTO:]NAME:LEFT,TOP,RIGHT,BOTTOM, such as 025_mug:120,80,260,210"
+
+
+@dataclass(frozen=True)
+class PhotoBoard(Command):
+    """Write the calibration board, an A4 page; laid on the table it tells where the camera was."""
+
+    out: Path = Path("board.pdf")
+    """PDF to write."""
+
+    def run(self) -> dict[str, Any]:
+        """Write the page."""
+        from osfcore.io.files import write_atomically
+        from osfcore.photo.board import Board, board_pdf
+
+        check_out(self.out, ".pdf")
+        board = Board()
+        write_atomically(self.out, board_pdf(board))
+        self.say(f"Wrote {self.out}. Print it at 100 %: a square is {1e3 * board.square_m:.0f} mm wide.")
+        return {"out": str(self.out), "square_m": board.square_m}
+
+
+@dataclass(frozen=True)
+class PhotoCalibrate(Command):
+    """Calibrate a camera from several photos of the board, and tell the error to expect on the table."""
+
+    photo: tyro.conf.Positional[tuple[Path, ...]]
+    """JPEG, PNG or HEIC: three or more by one camera with one zoom, of the board tilted by 30 to 45 degrees."""
+    out: Path = Path("camera.json")
+    """JSON to write."""
+    table: Path | None = None
+    """Photo of the board lying on the table, by the camera in the place where it stays; tells where it stands."""
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the board's centre lies then: x and y in metres, and by how many degrees it is turned to the left."""
+
+    def run(self) -> dict[str, Any]:
+        """Calibrate; the result is what the file holds."""
+        from osfcore.io.files import write_json
+        from osfcore.photo.calibration import board_place, calibrated_camera, calibration_to_json, sight
+
+        check_out(self.out, ".json")
+        place = board_place(*self.place)
+        views = [sight(read_photograph(path), path.name) for path in self.photo]
+        table = None if self.table is None else sight(read_photograph(self.table), self.table.name)
+        found = calibrated_camera(views, table, place)
+        result = calibration_to_json(found, self.out.stem)
+        write_json(self.out, result)
+        self.say(*_camera_text(found), f"Wrote {self.out}.")
+        return result
+
+
+def _camera_text(found: Calibration) -> Iterator[str]:
+    """The camera for people, and what would make it better."""
+    for name, rms in found.rms_px.items():
+        yield f"{name}: corners {rms:.2f} px from where they should appear."
+    (f, _, x), (_, _, y), _ = found.lens.intrinsics.tolist()
+    yield f"K: focal length {f:.1f} px (+- {found.focal_std_px:.1f}), centre {x:.1f}, {y:.1f}."
+    yield f"Distortion: k1 {found.lens.radial:.3f}. Corners scatter by {found.noise_px:.2f} px."
+    if found.T_world_camera is not None:
+        yield f"It stands at {', '.join(f'{value:.3f}' for value in found.T_world_camera.position)} m."
+    mean, worst = 1e3 * found.table.mean_m, 1e3 * found.table.worst_m
+    yield f"Expected error on the table: {mean:.1f} mm, at worst {worst:.1f} mm."
+    if found.advice is not None:
+        yield f"One more photo would make it {1e3 * found.advice.mean_m:.1f} mm: {found.advice.words}."
+
+
+@dataclass(frozen=True)
+class PhotoEstimate(DataCommand):
+    """Find known objects and the lamp in photographs; a box around each object, or a mask, says what to look for."""
+
+    photo: tuple[Path, ...]
+    """JPEG, PNG or HEIC; several of one table must all show the board."""
+    out: Path
+    """JSON to write."""
+    boxes: tuple[str, ...] = ()
+    """NAME:LEFT,TOP,RIGHT,BOTTOM [px] for each object; PHOTO:NAME:... if it is in another photo than the first."""
+    masks: tuple[Path, ...] = ()
+    """Folder with a mask of each object, NAME.png or mask_NAME.png or BOP's mask_visib; one for each photo."""
+    poses: Path | None = None
+    """Poses in the first photo to begin with: BOP's .csv or scene_gt.json, PoseCNN's .mat, or .json."""
+    image_id: tuple[int, ...] = ()
+    """Number of each photo in files of BOP."""
+    scene_id: int | None = None
+    """Number of the scene in a .csv of BOP."""
+    pose_source: str | None = None
+    """Whose poses in a photo.json; which variable of a .mat, such as poses_icp."""
+    pose_frame: Literal["bop", "ycb_video", "google_16k"] | None = None
+    """Origin of objects: box's centre, YCB-Video's models, or YCB's meshes; by default what such files usually have."""
+    focal: float | None = None
+    """Focal length in pixels; by default what the board or the camera tells."""
+    camera: Path | None = None
+    """What 'osf photo calibrate' has written about the camera that took the photos."""
+    images: Path | None = None
+    """Folder for a picture of each object: photo, outlines of mask and object, the object as found."""
+    seed: int = 0
+    """Of the searches."""
+
+    def run(self) -> dict[str, Any]:
+        """Estimate; the result is what the file holds."""
+        from osfcore.io.files import write_json
+        from osfcore.io.json_codec import encode
+        from osfcore.photo.poses import PhotoConfig, PhotoModels, estimate_photo
+        from osfcore.photo.summary import summarised
+        from osfcore.random_streams import Stream, stream_rng
+
+        photos, starts, notes = self._inputs(self.trained.names())
+        names = tuple(dict.fromkeys(name for photo in photos for name in photo.masks))
+        models = PhotoModels({name: self.trained.load(name) for name in names})
+        rng = stream_rng(self.seed, Stream.PHOTO_SEARCH)
+        last = follow(estimate_photo(models, photos, names, rng, PhotoConfig(starts)))
+        assert last is not None
+        result = encode(summarised(photos, last, models, notes))
+        write_json(self.out, result)
+        if self.images is not None:
+            _write_sheets(self.images, models, photos, last)
+        self.say(*_summary(result), f"Wrote {self.out}.")
+        return result
+
+    def _inputs(self, known: Collection[str]) -> tuple[tuple[Photograph, ...], dict[str, Pose], tuple[str, ...]]:
+        """Read everything, cheap checks first.
+
+        Args:
+            known: names of objects that can be found.
+
+        Returns:
+            The photographs with cameras and masks, poses in the world to begin with, and sentences for people.
+
+        Raises:
+            OsfError: with a sentence that says what is wrong.
+        """
+        from osfcore.contrib.bop import PoseChoice, read_poses
+
+        self._check_counts()
+        camera = None if self.camera is None else read_camera(self.camera)
+        raws = [read_photograph(path) for path in self.photo]
+        boxes: list[dict[str, Box]] = [{} for _ in raws]
+        for text in self.boxes:
+            number, name, box = _box(text, self.photo, raws)
+            if name not in known:
+                raise UnknownName("object", name, known)
+            boxes[number][name] = box
+        image = self.image_id[0] if self.image_id else None
+        choice = PoseChoice(image, self.scene_id, self.pose_source, self.pose_frame)
+        poses = {} if self.poses is None else read_poses(self.poses, choice)
+        photos, notes = [], []
+        masks = [
+            self._masks(known, raw, its, number) for number, (raw, its) in enumerate(zip(raws, boxes, strict=True))
+        ]
+        for path, raw, its in zip(self.photo, raws, masks, strict=True):
+            photo, its_notes = _located(path, raw, its, self.focal, camera, is_alone=len(raws) == 1)
+            photos.append(photo)
+            notes += its_notes if len(raws) == 1 else [f"{path.name}: {note}" for note in its_notes]
+        names = {name for its in masks for name in its}
+        starts = {name: photos[0].T_world_camera @ pose for name, pose in poses.items() if name in names}
+        if self.poses is not None:
+            unused, missing = (", ".join(sorted(found)) for found in (set(poses) - names, names - set(poses)))
+            if unused:
+                notes.append(f"Poses of {unused} were not used: nothing says which pixels show them.")
+            if missing:
+                notes.append(f"{missing} had no pose to begin with; all orientations were tried.")
+        return tuple(photos), starts, tuple(notes)
+
+    def _check_counts(self) -> None:
+        count = len(self.photo)
+        if not count:
+            raise InvalidInput("number of photos", 0, "1 or more")
+        for what, given in (("folders of masks", self.masks), ("numbers of images", self.image_id)):
+            if len(given) not in (0, count):
+                raise InvalidInput(f"number of {what}", len(given), f"{count}, one for each photo")
+        if not self.boxes and not self.masks:
+            raise InvalidInput("number of boxes", 0, "1 or more, or --masks given: an object needs a box or a mask")
+        if self.camera is not None and self.focal is not None:
+            raise InvalidInput("--focal", self.focal, "left out, since --camera tells the focal length")
+
+    def _masks(
+        self, known: Collection[str], raw: RawPhotograph, boxes: Mapping[str, Box], number: int
+    ) -> dict[str, Any]:
+        """Masks of one photo: from its folder, and where there is a box from that and a click in its middle."""
+        import numpy as np
+
+        from osfcore.contrib.bop import read_masks
+
+        masks: dict[str, Any] = {}
+        if self.masks:
+            height, width = raw.encoded.shape[:2]
+            image = self.image_id[number] if self.image_id else None
+            masks |= read_masks(self.masks[number], known, (raw.sent_size, (width, height)), image)
+        for name, (left, top, right, bottom) in boxes.items():
+            middle = np.array([[(left + right) / 2, (top + bottom) / 2]])
+            masks[name] = propose_mask(raw.eight_bit, (left, top, right, bottom), middle)
+        return masks
+
+
+def _box(text: str, paths: Sequence[Path], raws: Sequence[RawPhotograph]) -> tuple[int, str, Box]:
+    """Number of the photo, name, and box in pixels of the photo as it was read."""
+    owner, _, numbers = text.rpartition(":")
+    file, _, name = owner.rpartition(":")
+    try:
+        left, top, right, bottom = (float(number) for number in numbers.split(","))
+    except ValueError:
+        raise InvalidInput("box", text, _FORM) from None
+    fitting = [k for k, path in enumerate(paths) if file in (str(path), path.name)] if file else [0]
+    if len(fitting) != 1:
+        raise InvalidInput("photo of a box", shown(file), f"one of {', '.join(map(str, paths))}")
+    raw = raws[fitting[0]]
+    width, height = raw.sent_size
+    if not (max(left, 0) < min(right, width) and max(top, 0) < min(bottom, height)):  # also false for NaN
+        allowed = f"within the photo's {width} x {height} pixels, told as LEFT,TOP,RIGHT,BOTTOM"
+        raise InvalidInput(f"box of {shown(name)} [px]", numbers, allowed)
+    scale = max(raw.encoded.shape[:2]) / max(raw.sent_size)
+    return fitting[0], name, (scale * left, scale * top, scale * right, scale * bottom)
+
+
+def _located(
+    path: Path,
+    raw: RawPhotograph,
+    masks: Mapping[str, Any],
+    focal: float | None,
+    camera: KnownCamera | None,
+    *,
+    is_alone: bool,
+) -> tuple[Photograph, list[str]]:
+    """The photograph with its camera, free of distortion: over the board if it shows one, or as it was calibrated."""
+    from osfcore.photo.summary import locate, locate_calibrated
+
+    found = locate(raw, focal) if camera is None else locate_calibrated(raw, camera)
+    if found.T_world_camera is None and not is_alone:
+        allowed = f"to be seen, since there are several photos ({found.missing.rstrip('.')})"
+        raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed)
+    straight = {name: found.straightened(mask) for name, mask in masks.items()}
+    photo = to_photograph(found.raw, found.intrinsics, found.T_world_camera, straight)
+    return photo, list(found.notes)
+
+
+def _write_sheets(folder: Path, models: PhotoModels, photos: Sequence[Photograph], step: PhotoStep) -> None:
+    """NAME.png, or NAME-1.png and so on for each photo with a mask of it."""
+    from osfcore.inspection.contact_sheet import write_sheet
+
+    for found in step.found:
+        for number, photo in enumerate(photos, 1):
+            if found.name in photo.masks:
+                name = found.name if len(photos) == 1 else f"{found.name}-{number}"
+                write_sheet(folder / f"{name}.png", models, photo, found)
+
+
+def _summary(result: dict[str, Any]) -> Iterator[str]:
+    """The result for people: a line for each object, one for the light, the notes."""
+    for entry in result["objects"]:
+        x, y, z = (100 * v for v in entry["position"])
+        yield f"{entry['name']} at {x:.1f}, {y:.1f}, {z:.1f} cm; its outline fits by {100 * entry['iou']:.0f} %."
+        if entry["doubt"]:
+            yield f"  {entry['doubt']}"
+    if result["light"] and result["light"]["diffuse"]:
+        yield "The light is diffuse: nothing speaks for one lamp."
+    elif result["light"]:
+        light = result["light"]
+        far = f", {light['distance_m']:.2f} m away" if light["distance_m"] is not None else ""
+        yield f"Toward the lamp: {json.dumps([round(v, 2) for v in light['direction']])}{far}."
+    yield from result["notes"]
+
+
+Photo = Annotated[
+    Annotated[PhotoBoard, tyro.conf.subcommand("board")]
+    | Annotated[PhotoCalibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[PhotoEstimate, tyro.conf.subcommand("estimate")],
+    tyro.conf.OmitSubcommandPrefixes,
+]

@@ -1,0 +1,231 @@
+"""`osf train`: fields from image sets, dynamics from pushes, and a rival that predicts video."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from app.cli.command import Command, DataCommand, Flat, follow
+from app.cli.workers import worker_pool
+from osfcore.errors import InvalidInput
+from osfcore.experiments.rivals.train_fitvid import TrainFitVid, train_fitvid
+from osfcore.io.output_paths import SUFFIX
+
+if TYPE_CHECKING:
+    from osfcore.fields.train_osf import FieldSettings
+    from osfcore.fields.train_several import TrainOne
+    from osfcore.progress import Progress
+
+
+@dataclass(frozen=True)
+class TrainFieldCommand(Command):
+    """Fields of objects from image sets in the OSF format. A killed training goes on when started again."""
+
+    data: tuple[Path, ...]
+    """Folder with train/anno.json and test/anno.json; several such folders for as many objects."""
+    out: Path
+    """File to write, such as 006_mustard_bottle.safetensors; its metrics go beside it as .json. Of several sets: a
+    folder for files that are named after those of the sets."""
+    minutes: float = 30.0
+    """How long to train each [min]."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+    hollow: bool = False
+    """The object has hollows that no silhouette shows, such as a bowl's."""
+    iterations: int | None = None
+    """Instead of a time budget: that many steps of descent, repeatable on one machine."""
+    method: Literal["ours", "paper", "nerf"] = "ours"
+    """What is trained: our field; a KiloOSF as published, tiny networks alone over a teacher; ours without light."""
+    recipe: Literal["direct", "distil"] = "direct"
+    """Of ours: direct learns from the images at once; distil, the paper's way, goes over a teacher and is slower."""
+    teacher_width: int = 64
+    """Units of each layer of the teacher."""
+    teacher_depth: int = 4
+    """Layers of the teacher."""
+    workers: int = 1
+    """Processes that train several objects side by side, each in its share of the threads."""
+    cluster: str | None = None
+    """Address of a Dask scheduler whose workers train instead; they need the same image sets at the same place."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result tells PSNR [dB] on the test images, size and time."""
+        places = self._places()
+        outs = [out for _, out in places]
+        settings, train = self._paper(places) if self.method == "paper" else self._ours(places)
+        workers = min(self.workers, len(places))
+        with worker_pool(workers, self.cluster) as executor:
+            if len(places) == 1 and executor is None:
+                follow(train(settings[0]))
+            else:
+                follow(self._several(settings, train, executor, workers))
+        found = {out.stem: _metrics(out) for out in outs}
+        for out, metrics in zip(outs, found.values(), strict=True):
+            full, mask = metrics["psnr_full"], metrics["psnr_mask"]
+            quality = f"{full:.1f} dB on unseen views and lights, {mask:.1f} dB in the mask"
+            self.say(f"Wrote {out}: {quality}, {metrics['bytes'] / 1e6:.2f} MB.")
+        return {"out": str(self.out), **(found[self.out.stem] if len(outs) == 1 else {"fields": found})}
+
+    def _places(self) -> list[tuple[Path, Path]]:
+        """Each image set with the file to write."""
+        if len(self.data) == 1:
+            return [(self.data[0], self.out)]
+        names = [data.absolute().name for data in self.data]
+        if not names or len(set(names)) < len(names):
+            allowed = "one folder or more, no two of one name, which becomes that of the field"
+            raise InvalidInput("choice of image sets", ", ".join(names) or "none", allowed)
+        if self.out.suffix == SUFFIX:
+            raise InvalidInput("output of several image sets", self.out, "a folder")
+        return [(data, self.out / f"{name}{SUFFIX}") for data, name in zip(self.data, names, strict=True)]
+
+    def _several(
+        self, settings: Sequence[FieldSettings], train: TrainOne, executor: Executor | None, workers: int
+    ) -> Iterator[Progress]:
+        from torch import get_num_threads
+
+        from osfcore.fields.train_several import train_several
+
+        threads = 1 if self.cluster is not None else max(1, get_num_threads() // workers)
+        return train_several(settings, train, executor, threads=threads, shares_disk=self.cluster is None)
+
+    def _ours(self, places: Sequence[tuple[Path, Path]]) -> tuple[Sequence[FieldSettings], TrainOne]:
+        from osfcore.fields.train_kiloosf import TrainField, train_field
+
+        given = {"hollow": self.hollow, "recipe": self.recipe, "lit": self.method != "nerf", **self._common()}
+        return [TrainField(data, out, **given) for data, out in places], train_field
+
+    def _paper(self, places: Sequence[tuple[Path, Path]]) -> tuple[Sequence[FieldSettings], TrainOne]:
+        from osfcore.fields.train_osf import FieldSettings
+        from osfcore.paper.train_fields import train_paper_field
+
+        for option, is_given in (("--hollow", self.hollow), ("--recipe", self.recipe != "direct")):
+            if is_given:
+                raise InvalidInput(f"option {option}", "given", "left out with --method paper, which has no such thing")
+        return [FieldSettings(data, out, **self._common()) for data, out in places], train_paper_field
+
+    def _common(self) -> dict[str, Any]:
+        names = ("minutes", "device", "seed", "iterations", "teacher_width", "teacher_depth")
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclass(frozen=True)
+class TrainTableCommand(Command):
+    """The table's field from an image set of the bare table."""
+
+    data: Path
+    """Folder with train/anno.json and test/anno.json, such as 'osf collect table' writes."""
+    out: Path
+    """File to write, such as table.safetensors; its metrics go beside it as .json."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result holds the metrics."""
+        from osfcore.fields.train_table import TrainTable, train_table
+
+        follow(train_table(TrainTable(self.data, self.out, self.device, self.seed)))
+        metrics = _metrics(self.out)
+        self.say(f"Wrote {self.out}: {metrics['psnr']:.1f} dB on unseen views and lights.")
+        return {"out": str(self.out), **metrics}
+
+
+@dataclass(frozen=True)
+class TrainDynamicsCommand(DataCommand):
+    """What pushes do, from recorded ones. A killed training goes on when started again."""
+
+    data: tuple[Path, ...]
+    """Push files that 'osf collect pushes' wrote; one in twelve episodes is held out."""
+    out: Path
+    """File to write, such as pushes.safetensors; its metrics go beside it as .json."""
+    method: Literal["ours", "paper"] = "ours"
+    """What is trained: our model, or the paper's as published, on windows of three actions alone."""
+    iterations: int | None = None
+    """Steps of descent at most: of ours on single substeps (default 26000), of the paper's (default 2000)."""
+    long_iterations: int | None = None
+    """Of ours: steps of descent on windows of three actions, after these (default 500)."""
+    patience: int | None = None
+    """Measurements on held-out episodes without a better one after which training stops (ours 20, paper 12)."""
+    without: tuple[str, ...] = ()
+    """Of ours: objects whose episodes are left out."""
+    hidden: int | None = None
+    """Width of the network (ours 192, paper 128)."""
+    batch: int | None = None
+    """Substeps, or windows of the paper's, in each step of descent (ours 512, paper 256)."""
+    long_batch: int | None = None
+    """Of ours: windows in each (default 96)."""
+    rate: float | None = None
+    """Of learning, at its highest (ours 0.004, paper 0.001)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What computes; auto takes a GPU where there is one."""
+    seed: int = 0
+    """Of everything random."""
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result holds the metrics."""
+        follow(self._train_paper() if self.method == "paper" else self._train_ours())
+        metrics = _metrics(self.out)
+        mm, deg = metrics["validation_mm_4"], metrics["validation_deg_4"]
+        self.say(f"Wrote {self.out}: held out, {mm:.1f} mm and {deg:.1f} deg after 4 steps.")
+        return {"out": str(self.out), **metrics}
+
+    def _train_ours(self) -> Iterator[Progress]:
+        from osfcore.dynamics.rollout import load_shapes
+        from osfcore.dynamics.train import TrainDynamics, train_dynamics
+
+        given = self._given("iterations", "long_iterations", "patience", "hidden", "batch", "long_batch", "rate")
+        config = TrainDynamics(self.data, self.out, without=self.without, device=self.device, seed=self.seed, **given)
+        return train_dynamics(config, load_shapes(self.data_dir, self.trained, self.trained.names()))
+
+    def _train_paper(self) -> Iterator[Progress]:
+        from osfcore.paper.dynamics import longest_axes
+        from osfcore.paper.train_dynamics import TrainPaperDynamics, train_paper_dynamics
+
+        for name in (*self._given("long_iterations", "long_batch"), *(("without",) if self.without else ())):
+            option = f"--{name.replace('_', '-')}"
+            raise InvalidInput(f"option {option}", "given", "left out with --method paper, which has no such thing")
+        given = self._given("iterations", "patience", "hidden", "batch", "rate")
+        config = TrainPaperDynamics(self.data, self.out, device=self.device, seed=self.seed, **given)
+        return train_paper_dynamics(config, longest_axes(self.trained, self.trained.names()))
+
+    def _given(self, *names: str) -> dict[str, Any]:
+        """Those of some options that were given; the others are the method's own defaults."""
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+
+@dataclass(frozen=True)
+class TrainFitVidCommand(Command):
+    """FitVid, which predicts video, to compare with. A killed training goes on when started again."""
+
+    settings: Flat[TrainFitVid]
+
+    def run(self) -> dict[str, Any]:
+        """Train with a progress bar; the result holds the metrics."""
+        out = self.settings.out
+        follow(train_fitvid(self.settings))
+        metrics = _metrics(out)
+        for horizon, means in metrics["horizons"].items():
+            psnr = f"{means['psnr']:.1f} dB (the last known frame, copied: {means['psnr_copied']:.1f} dB)"
+            self.say(f"Wrote {out}: held out, over {horizon} steps, {psnr}.")
+        return {"out": str(out), **metrics}
+
+
+def _metrics(out: Path) -> dict[str, Any]:
+    return json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+
+
+Train = Annotated[
+    Annotated[TrainFieldCommand, tyro.conf.subcommand("field")]
+    | Annotated[TrainTableCommand, tyro.conf.subcommand("table")]
+    | Annotated[TrainDynamicsCommand, tyro.conf.subcommand("dynamics")]
+    | Annotated[TrainFitVidCommand, tyro.conf.subcommand("fitvid")],
+    tyro.conf.OmitSubcommandPrefixes,
+]
