@@ -1,7 +1,9 @@
 """Views of single pages, with browsers that speak viser's protocol through the relay."""
 
+import gc
 import threading
 import time
+import weakref
 from types import SimpleNamespace
 
 import msgspec
@@ -208,6 +210,16 @@ def test_a_page_that_is_reloaded_while_a_replay_opens_shows_it_in_its_new_view(s
     finally:
         slow.release.set()
         views.close()
+
+
+def test_what_a_browser_that_has_left_occupied_is_freed_without_waiting_for_python(live):
+    gc.disable()  # which would free it some day, too
+    try:
+        with opened(live, "page") as page:
+            left = weakref.ref(page.client)
+        until(lambda: left() is None)
+    finally:
+        gc.enable()
 
 
 def test_a_page_chooses_between_meshes_and_beliefs(live, shown):
