@@ -139,6 +139,9 @@ class Simulation:
             case CreateScene():
                 return self._create(command)
             case AdoptScene(record):
+                if record.id in self._records:
+                    self._forget_world(record.id)
+                    self._tell(record)
                 self._records[record.id] = record
                 return record
             case DropScene(scene):

@@ -6,6 +6,7 @@ import secrets
 import threading
 import uuid
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from app.processes.messages.scene_messages import (
@@ -198,9 +199,15 @@ class Scenes:
             return record
 
     def reset_scene(self, scene: str) -> SceneRecord:
-        """Put a scene back to how it was created; raises UnknownName if there is none, SceneHeld if a job uses it."""
+        """Put a scene back to how it was created.
+
+        Raises:
+            UnknownName: if there is none.
+            SceneHeld: if a job uses it.
+            CannotStore: if the disk refuses; then it is as before.
+        """
         self._check_free(scene)
-        return self._change(ResetScene(scene))
+        return self._change(ResetScene(scene), can_be_undone=True)
 
     def edit_scene(
         self, scene: str, light: Light | None = None, poses: tuple[tuple[str, Pose], ...] = (), *, settle: bool = False
@@ -217,10 +224,11 @@ class Scenes:
             UnknownName: if there is no such scene or object.
             SceneHeld: if a job uses the scene.
             OsfError: if something would overlap or makes no sense; then nothing moves.
+            CannotStore: if the disk refuses; then all is as before.
         """
         self._check_free(scene)
         _check_poses(poses)
-        return self._change(EditScene(scene, light, poses, settle))
+        return self._change(EditScene(scene, light, poses, settle), can_be_undone=True)
 
     def act(self, scene: str, actions: Iterable[object]) -> SceneRecord:
         """Hold each velocity (vx, vy, 0) [m/s] for 0.2 s.
@@ -281,13 +289,30 @@ class Scenes:
 
     # Inside
 
-    def _change(self, command: ResetScene | EditScene | Act) -> SceneRecord:
-        self.scene(command.id)
+    def _change(self, command: ResetScene | EditScene | Act, *, can_be_undone: bool = False) -> SceneRecord:
+        """Change a scene and store it.
+
+        Args:
+            command: what to do.
+            can_be_undone: if the disk refuses. A push cannot, and must not be asked for twice: it is stored later.
+
+        Raises:
+            UnknownName: if there is no such scene.
+            CannotStore: if the disk refuses, and the change was undone.
+        """
+        before = self.scene(command.id)
         record: SceneRecord = self._simulation.call(command)
         with self._lock:
             latest = self._records.get(command.id)
-            if latest is not None:  # a push is not undone by a full disk, and must not be asked for twice
-                self._store.save_scene(latest, can_wait=True)
+            if latest is None:
+                return record
+            try:
+                self._store.save_scene(latest, can_wait=not can_be_undone)
+            except CannotStore:
+                undone = replace(before, revision=latest.revision + 1)  # there are pictures of the revision between
+                self._records[command.id] = undone
+                self._simulation.submit(AdoptScene(undone))
+                raise
         return record
 
     def _show(self, scene: str | None) -> None:

@@ -62,7 +62,7 @@ class CreateScene:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AdoptScene:
-    """Take over a scene that was known before this simulation started. Answered by its SceneRecord."""
+    """Take over a scene that was known before this simulation started, or put one back. Answered by its SceneRecord."""
 
     record: SceneRecord
 

@@ -339,6 +339,35 @@ def test_a_push_that_cannot_be_stored_has_happened_and_is_stored_later(open_runn
     assert again.scene(scene.id).time_s == moved.time_s
 
 
+@pytest.mark.slow
+def test_what_a_hand_moves_on_a_full_disk_is_refused_and_undone(open_runner):
+    runner = open_runner(demo_scene=False)
+    made = runner.create_scene(names=(BOX,), seed=3, light=Light(np.array([0.0, 0.0, 1.5])))
+    moved = runner.edit_scene(made.id, light=Light(np.array([0.0, 0.5, 1.5])))
+    lifted = Pose(made.state.pose(BOX).position + np.array([0.0, 0.1, 0.05]), made.state.pose(BOX).quaternion)
+    picture = TakeImage(made.id, "0", 64)
+
+    def seen():
+        return asyncio.run(runner.image(picture))
+
+    before = seen()
+    for change in (
+        lambda: runner.edit_scene(made.id, light=Light(np.array([0.5, 0.0, 1.5]))),
+        lambda: runner.edit_scene(made.id, poses=((BOX, lifted),)),
+        lambda: runner.reset_scene(made.id),
+    ):
+        with full_disk(), pytest.raises(CannotStore):
+            change()
+        now = runner.scene(made.id)
+        assert now.revision > moved.revision
+        np.testing.assert_array_equal(now.state.light.position, moved.state.light.position)
+        np.testing.assert_allclose(now.state.poses.position, moved.state.poses.position, atol=1e-9)
+        assert seen() == before
+        assert runner.unwritten == 0
+    again = runner.edit_scene(made.id, light=Light(np.array([0.5, 0.0, 1.5])))
+    assert open_runner(demo_scene=False).scene(made.id).revision == again.revision
+
+
 def test_what_is_set_aside_at_the_start_is_told(open_runner, data_dir, caplog):
     with contextlib.closing(Store(data_dir)) as store:
         store.save_job("a", 1, {"id": "a"})
