@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -61,6 +62,31 @@ def serving(app):
         yield f"http://127.0.0.1:{port}"
     finally:
         server.should_exit = True
+        thread.join()
+
+
+@contextlib.contextmanager
+def dripping(first):
+    """The address of a server that answers with these bytes, and then with one now and then, for ever."""
+    ends = threading.Event()
+
+    def drip(client):
+        with client, contextlib.suppress(OSError):
+            client.sendall(first)
+            while not ends.wait(0.02):
+                client.sendall(b"a")
+
+    def accept():
+        with contextlib.suppress(OSError):
+            while True:
+                threading.Thread(target=drip, args=server.accept()[:1]).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=accept)
+        thread.start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
+        ends.set()
+        server.shutdown(socket.SHUT_RDWR)
         thread.join()
 
 

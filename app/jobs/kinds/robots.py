@@ -1,7 +1,8 @@
 """The job that drives a robot toward a goal photo.
 
-It looks and draws a first plan, and then rests until it is told that the robot may move: nothing has moved before, and
-nothing moves without. Its goal photo lies in its inputs as `goal.png`. It leaves what `osf robot drive` leaves.
+It looks and draws a first plan, and then rests until somebody permits the robot to move: nothing has moved before, and
+nothing moves without. Its goal photo lies in its inputs as `goal.png`. It leaves what `osf robot drive` leaves, and as
+cameras/NAME.jpg what the cameras saw last, rewritten with every look.
 """
 
 from __future__ import annotations
@@ -12,22 +13,27 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import quote
 
-from app.episodes.file_names import GOAL_FILE
-from app.episodes.robots.stopped_report import STOPPED as REPORT_STOPPED
-from app.episodes.robots.stopped_report import tell_stopped
+from app.episodes.file_names import CAMERAS_FOLDER, GOAL_FILE, REPORT_FILE, STOPPED
 from app.jobs.job import INPUTS, Job
 from app.jobs.kind import JobKind
 from app.jobs.kinds.episodes import settings_of, use_one_thread
 from osfcore.contrib.robots.robot import ConnectionLost, SafetyLimits
+from osfcore.errors import OsfError
+from osfcore.estimation.camera_response import srgb_of_linear
+from osfcore.io.files import as_mapping, read_json, write_atomically, write_json
+from osfcore.io.image_file import encode_jpeg, to_uint8
 
 if TYPE_CHECKING:
-    from app.episodes.robots.robot_drive import DriveOrder, RobotDrive
+    from app.episodes.robot import DriveOrder, RobotDrive
     from app.jobs.context import JobContext
     from osfcore.control.events import Event
+    from osfcore.geometry.states import Observation
 
 Drives = Literal["looking", "asked", "driving", "over", "lost"]
-STOPPED = "somebody stopped it"
+_CANCELLED = "somebody stopped it"
+_CANCELLED_SENTENCE = "The robot was stopped: its job was cancelled."
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +70,7 @@ def robot_job(params: dict[str, Any], place: JobContext) -> Iterator[RobotProgre
     Raises:
         OsfError: if the order cannot be met, the robot does not answer or was stopped, or the disk refuses.
     """
-    from app.episodes.robots.robot_drive import RobotDrive
+    from app.episodes.robot import RobotDrive
 
     assert place.orders is not None, "the job's process sets it"
     use_one_thread()
@@ -73,7 +79,7 @@ def robot_job(params: dict[str, Any], place: JobContext) -> Iterator[RobotProgre
     yield progress
     try:
         with contextlib.closing(RobotDrive(order, may_move.is_set)) as drive:
-            place.orders.on_cancel(lambda: drive.stop(STOPPED))
+            place.orders.on_cancel(lambda: drive.stop(_CANCELLED))
             for step in _driven(drive, progress, may_move, place):
                 progress = step
                 yield step
@@ -88,7 +94,6 @@ def robot_job(params: dict[str, Any], place: JobContext) -> Iterator[RobotProgre
 def _driven(
     drive: RobotDrive, progress: RobotProgress, may_move: threading.Event, place: JobContext
 ) -> Iterator[RobotProgress]:
-    from app.episodes.robots.camera_files import write_pictures
     from osfcore.control.events import Observed, Planning
 
     assert place.orders is not None
@@ -99,10 +104,8 @@ def _driven(
             write_pictures(place.folder, event.observation)
         yield progress
         if isinstance(event, Planning) and not may_move.is_set():
-            while not may_move.is_set():
-                yield replace(
-                    progress, drives="asked", note="Waiting for permission to move"
-                )  # cancelled, it ends here
+            while not may_move.is_set():  # a job that was cancelled ends with the next line
+                yield replace(progress, drives="asked", note="Waiting for permission to move")
                 change = place.orders.next_change() or {}
                 if change.get("allowed") is True:  # other parameters may change, too
                     may_move.set()
@@ -111,7 +114,7 @@ def _driven(
 
 
 def _after(progress: RobotProgress, event: Event) -> RobotProgress:
-    from app.episodes.event_notes import note_of
+    from app.episodes.progress import note_of
     from osfcore.control.events import ActionExecuted, Finished, Stepped
 
     progress = replace(progress, note=note_of(event) or progress.note)
@@ -127,7 +130,7 @@ def _after(progress: RobotProgress, event: Event) -> RobotProgress:
 
 
 def _order(params: dict[str, Any], place: JobContext) -> DriveOrder:
-    from app.episodes.robots.robot_drive import DriveOrder
+    from app.episodes.robot import DriveOrder
 
     goal: Path = place.folder / INPUTS / GOAL_FILE
     limits = SafetyLimits((*params["box"],), params["top_speed_m_s"])  # pyright: ignore[reportArgumentType]
@@ -137,17 +140,65 @@ def _order(params: dict[str, Any], place: JobContext) -> DriveOrder:
     )  # fmt: skip
 
 
-_WITHOUT_A_WORD = "The robot was stopped: its job was cancelled."
-
-
 def _stopped(job: Job, folder: Path) -> Job:
-    """Return the job of a robot that was broken off with the reason in it and, in the same words, in its report."""
+    """Write why the robot was stopped into a job that was broken off and its report, if that says of no other end.
+
+    The job's process may have had no time for it, or may not have known the reason.
+    """
     result = dict(job.result or {})
     if result.get("outcome") is None:
-        why = job.error or _WITHOUT_A_WORD
-        tell_stopped(folder, why)
-        result |= {"outcome": REPORT_STOPPED, "text": why}
+        why = job.error or _CANCELLED_SENTENCE
+        path = folder / REPORT_FILE
+        with contextlib.suppress(OsfError):  # whatever has become of the file, the job has the reason
+            report = read_json(path, as_mapping)
+            if report.get("outcome") in (None, STOPPED):
+                write_json(path, {**report, "outcome": STOPPED, "text": why})
+        result |= {"outcome": STOPPED, "text": why}
     return replace(job, result=result)
 
 
 ROBOT = JobKind("robot", "episode with the robot", robot_job, keeps_steps=True, on_broken_off=_stopped)
+
+
+# What the robot's cameras saw last, in the job's folder.
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPicture:
+    """What a camera saw.
+
+    Attributes:
+        jpeg: the picture.
+        at_s: when it had been taken, since the epoch [s].
+    """
+
+    jpeg: bytes
+    at_s: float
+
+
+def write_pictures(folder: Path, seen: Observation) -> None:
+    """Keep what all cameras see, as cameras encode it, in place of what they saw before.
+
+    Raises:
+        CannotWrite: if the disk refuses.
+    """
+    for camera, image in zip(seen.cameras, seen.images, strict=True):
+        write_atomically(_picture_path(folder, camera.name), encode_jpeg(to_uint8(srgb_of_linear(image))))
+
+
+def read_picture(folder: Path, camera: str) -> CameraPicture | None:
+    """Return what a camera saw last; None if nothing was kept.
+
+    Args:
+        folder: of the job.
+        camera: its name.
+    """
+    path = _picture_path(folder, camera)
+    try:
+        return CameraPicture(path.read_bytes(), path.stat().st_mtime)
+    except OSError:
+        return None
+
+
+def _picture_path(folder: Path, camera: str) -> Path:
+    return folder / CAMERAS_FOLDER / f"{quote(camera, safe='')}.jpg"  # names of ROS have slashes

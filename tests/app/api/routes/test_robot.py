@@ -1,7 +1,9 @@
 import contextlib
 import io
 import json
+import multiprocessing
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import httpx2
 import numpy as np
@@ -9,11 +11,11 @@ import pytest
 from PIL import Image
 
 from app.episodes.file_names import REPORT_FILE
-from app.episodes.robots.camera_files import write_pictures
 from app.jobs.context import JobCancelled, JobStep
+from app.jobs.kinds.robots import write_pictures
 from app.jobs.process import JobClock
 from app.services import runner
-from app.services.robots import robot_table
+from app.services.robot import RobotTable
 from osfcore.contrib.robots.robot import ConnectionLost
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.states import Observation
@@ -21,7 +23,7 @@ from osfcore.io.files import write_json
 from osfcore.io.scene_file import camera_to_json
 from tests.app.conftest import running, until
 from tests.live import free_port
-from tests.support.robots import NAMES, example, noted, serving, simulated
+from tests.support.robots import NAMES, dripping, example, noted, serving, simulated
 from tests.support.ros_robots import StandIn
 
 PAGE = {"X-OSF-Visitor": "page"}
@@ -69,7 +71,7 @@ def robot(library):
 def service_with(monkeypatch, library, tmp_path, lease_s=60.0, **settings):
     """A client of a service; a page may be silent for `lease_s`, by default longer than any test takes."""
     monkeypatch.setattr(runner, "JobProcess", Process)
-    monkeypatch.setattr(robot_table.RobotTable.__init__, "__defaults__", (lease_s,))
+    monkeypatch.setattr(RobotTable.__init__, "__defaults__", (lease_s,))
     with running(library, tmp_path, standby=False, **settings) as client:
         yield client
 
@@ -138,6 +140,21 @@ def test_a_robot_that_does_not_answer_is_lost(monkeypatch, library, tmp_path):
         told = client.get("/api/robot").json()
         assert (told["state"], "does not answer" in told["text"]) == ("lost", True)
         assert client.post("/api/robot/episodes", json={"goal": "x", "names": ["025_mug"]}).status_code == 503
+
+
+def test_a_robot_that_drips_holds_nobody_up_for_ever(monkeypatch, library, tmp_path):
+    first = b"HTTP/1.1 200 OK\r\nContent-Length: 900000\r\n\r\n"
+    with dripping(first) as url, service_with(monkeypatch, library, tmp_path, robot=url) as client:
+        with ThreadPoolExecutor(24) as many:
+            states = list(many.map(lambda _: state(client), range(24)))
+        assert states == ["lost"] * 24
+
+
+def test_pictures_of_the_robot_are_decoded_in_a_process_of_its_own(service):
+    decoder = "osf-decoder-of-photos"
+    assert decoder not in {child.name for child in multiprocessing.active_children()}
+    assert service.get("/api/robot/cameras/0.jpg").status_code == 200
+    assert decoder in {child.name for child in multiprocessing.active_children()}
 
 
 def test_no_request_names_the_robot(service, robot):

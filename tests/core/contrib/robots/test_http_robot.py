@@ -22,7 +22,7 @@ from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import encode_png
 from tests.live import free_port
 from tests.support.errors import about
-from tests.support.robots import NAMES, example, serving, until
+from tests.support.robots import NAMES, dripping, example, serving, until
 from tests.support.same import assert_same
 
 FAST = SafetyLimits(top_speed_m_s=0.42)
@@ -193,31 +193,6 @@ def test_pictures_that_are_too_large_are_refused_before_they_are_decoded(odd, od
     odd[1].picture = large.getvalue()
     with pytest.raises(CorruptFile, check=about("2048 x 3000 pixels")):
         odd_robot.observe()
-
-
-@contextlib.contextmanager
-def dripping(first):
-    """The address of a server that answers with these bytes, and then with one now and then, for ever."""
-    ends = threading.Event()
-
-    def drip(client):
-        with client, contextlib.suppress(OSError):
-            client.sendall(first)
-            while not ends.wait(0.02):
-                client.sendall(b"a")
-
-    def accept():
-        with contextlib.suppress(OSError):
-            while True:
-                threading.Thread(target=drip, args=server.accept()[:1]).start()
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        thread = threading.Thread(target=accept)
-        thread.start()
-        yield f"http://127.0.0.1:{server.getsockname()[1]}"
-        ends.set()
-        server.shutdown(socket.SHUT_RDWR)
-        thread.join()
 
 
 @pytest.mark.parametrize("first", [b"HTTP/1.1 200 OK\r\nA: ", b"HTTP/1.1 200 OK\r\nContent-Length: 900000\r\n\r\n"])

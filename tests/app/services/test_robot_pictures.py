@@ -3,8 +3,7 @@ import threading
 import numpy as np
 import pytest
 
-from app.services.robots import robot_pictures
-from app.services.robots.robot_pictures import NoPicture, RobotPictures
+from app.services.robot import NoPicture, RobotPictures
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import default_cameras
 from osfcore.io.image_file import encode_jpeg
@@ -14,13 +13,10 @@ CAMERAS = default_cameras(64)
 FILES = (encode_jpeg(np.full((64, 64, 3), 90, np.uint8)),) * len(CAMERAS)
 
 
-@pytest.fixture(autouse=True)
-def impatient(monkeypatch):
-    monkeypatch.setattr(robot_pictures, "FRESH_S", 0.0)
-
-
 def of(take, may_look=True):
-    return RobotPictures(lambda: CAMERAS, take, lambda: may_look, lambda: None)
+    return RobotPictures(
+        lambda: CAMERAS, take, lambda file: read_photograph(file).eight_bit, lambda: may_look, lambda: None, fresh_s=0.0
+    )
 
 
 def test_nobody_waits_for_a_robot_that_takes_its_time_who_can_be_shown_what_was_seen_before():
@@ -72,6 +68,28 @@ def test_why_there_is_no_picture_is_told():
         of(take).one("2")
     with pytest.raises(NoPicture):
         of(take, may_look=False).one("2")
+
+
+def test_after_a_first_look_that_failed_nobody_waits_for_the_next_one():
+    begun, may_end = threading.Event(), threading.Event()
+    may_end.set()
+
+    def take():
+        begun.set()
+        assert may_end.wait(20)
+        raise OsfError("The lens cap is on.")
+
+    pictures = of(take)
+    with pytest.raises(NoPicture):
+        pictures.one("0")
+    begun.clear()
+    may_end.clear()
+    slow = threading.Thread(target=pictures.all)
+    slow.start()
+    assert begun.wait(20)
+    assert {now.picture for now in pictures.all()} == {None}
+    may_end.set()
+    slow.join()
 
 
 def test_large_pictures_are_reduced():

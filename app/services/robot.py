@@ -1,4 +1,4 @@
-"""A robot's table: asking for episodes on it, allowing the first motion, and a stop that waits for nothing."""
+"""The robot of a service: what its cameras see, episodes on its table, permission for the first motion, and a stop."""
 
 from __future__ import annotations
 
@@ -12,21 +12,29 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
 from app.episodes.file_names import GOAL_FILE
 from app.jobs.job import Job, JobChanged
+from app.jobs.kinds.robots import CameraPicture, read_picture
 from app.services.episodes import nested
 from app.services.event_hub import Notice
 from app.services.fields import FieldCatalogue
 from app.services.goals.goals import Goals
-from app.services.robots.robot_pictures import RobotPictures
 from app.services.runner import Runner
 from app.services.service_settings import Settings
 from app.storage.database import CannotStore
+from app.storage.photos import PhotoReader
 from osfcore.contrib.robots.connect import check_address, connect
-from osfcore.contrib.robots.http_robot import HttpRobot
+from osfcore.contrib.robots.http_robot import KEPT_SIDE, HttpRobot
 from osfcore.contrib.robots.robot import RobotDescription, SafetyLimits
-from osfcore.errors import InvalidInput, OsfError, UnknownName
+from osfcore.errors import OsfError, UnknownName, check_unique, shown
+from osfcore.geometry.cameras import Camera
+from osfcore.io.image_file import encode_jpeg
 
+FRESH_S = 1.0  # the robot is not asked again before: for pictures, or whether it answers by now
 KIND = "robot"
 LEASE_S = 3.0  # without a word from the page that let the robot move
 _STOP_WAIT_S = 0.5  # for the robot to confirm a stop, before the answer
@@ -43,6 +51,127 @@ class NoRobot(OsfError):
         super().__init__("This service has no robot; whoever starts it can name one: osf serve --robot URL.")
 
 
+class NoPicture(OsfError):
+    """A camera that has shown nothing yet.
+
+    Args:
+        camera: its name.
+        reason: why, a sentence; "" if nothing went wrong.
+    """
+
+    def __init__(self, camera: str, reason: str) -> None:
+        why = reason or "It comes with the first look of the episode."
+        super().__init__(f"There is no picture of the robot's camera {shown(camera)} yet. {why}")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CameraNow:
+    """A camera and what it saw last.
+
+    Attributes:
+        camera: of the robot, as its pictures are kept.
+        picture: None if it has shown nothing yet.
+    """
+
+    camera: Camera
+    picture: CameraPicture | None
+
+
+class RobotPictures:
+    """The last pictures of a robot's cameras, whoever took them. Methods block; any thread may call.
+
+    While an episode looks or moves, its own looks are what is shown: pictures besides could hold up the robot. At any
+    other time whoever asks has the robot look, if the last attempt is more than a second old.
+
+    Args:
+        cameras: returns those of the robot; raises OsfError if it has never answered.
+        take: takes a picture file with each of them; raises OsfError if it does not answer.
+        read: decodes such a file; raises OsfError if it cannot be used.
+        may_look: returns whether that disturbs nobody.
+        episode: returns the folder of the latest episode, if there is one.
+        fresh_s: age from which on a new picture is taken [s].
+    """
+
+    def __init__(
+        self,
+        cameras: Callable[[], tuple[Camera, ...]],
+        take: Callable[[], tuple[bytes, ...]],
+        read: Callable[[bytes], UInt8[np.ndarray, "h w 3"]],
+        may_look: Callable[[], bool],
+        episode: Callable[[], Path | None],
+        fresh_s: float = FRESH_S,
+    ) -> None:
+        self._cameras, self._take, self._read = cameras, take, read
+        self._may_look, self._episode, self._fresh_s = may_look, episode, fresh_s
+        self._looking = threading.Lock()
+        self._tried_at = -fresh_s
+        self._problem = ""
+        self._own: dict[str, CameraPicture] = {}
+
+    def all(self) -> tuple[CameraNow, ...]:
+        """Return all cameras with what they saw last.
+
+        Raises:
+            NoRobot: if there is none.
+            ConnectionLost, RobotRefused: if it has never answered.
+        """
+        cameras = self._cameras()
+        is_first = not self._own and not self._problem  # who comes during the first look waits for it
+        if self._looking.acquire(blocking=is_first):
+            try:
+                if self._may_look() and time.monotonic() - self._tried_at >= self._fresh_s:
+                    self._look(cameras)
+                    self._tried_at = time.monotonic()
+            finally:
+                self._looking.release()
+        own, folder = self._own, self._episode()
+        seen = []
+        for camera in cameras:
+            kept = None if folder is None else read_picture(folder, camera.name)
+            known = [picture for picture in (kept, own.get(camera.name)) if picture is not None]
+            seen.append(CameraNow(camera, max(known, key=lambda picture: picture.at_s, default=None)))
+        return tuple(seen)
+
+    def one(self, name: str) -> CameraPicture:
+        """Return what one camera saw last.
+
+        Raises:
+            UnknownName: if there is no such camera.
+            NoPicture: if it has shown nothing yet.
+            NoRobot, ConnectionLost, RobotRefused: as above.
+        """
+        known = {now.camera.name: now.picture for now in self.all()}
+        if name not in known:
+            raise UnknownName("camera of the robot", name, list(known))
+        picture = known[name]
+        if picture is None:
+            raise NoPicture(name, self._problem)
+        return picture
+
+    def _look(self, cameras: tuple[Camera, ...]) -> None:
+        """Take pictures; if the robot does not answer, those before are still the last ones."""
+        try:
+            jpegs = [_small_jpeg(self._read(file)) for file in self._take()]
+        except OsfError as error:
+            self._problem = str(error)
+            return
+        pictures = [CameraPicture(jpeg, time.time()) for jpeg in jpegs]
+        self._problem = ""
+        self._own = {camera.name: picture for camera, picture in zip(cameras, pictures, strict=True)}
+
+
+def _small_jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Encode a picture, no larger than estimates look at."""
+    scale = KEPT_SIDE / max(image.shape[:2])
+    if scale < 1:
+        size = (round(scale * image.shape[1]), round(scale * image.shape[0]))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return encode_jpeg(image)
+
+
+# Episodes on its table, and their stop.
+
+
 class RobotBusy(OsfError):
     """A robot does one thing at a time."""
 
@@ -51,7 +180,7 @@ class RobotBusy(OsfError):
 
 
 class NothingAsked(OsfError):
-    """A permission that nobody waits for."""
+    """A permission that nothing waits for."""
 
     def __init__(self) -> None:
         super().__init__("No episode of this name waits for permission to move the robot.")
@@ -59,14 +188,14 @@ class NothingAsked(OsfError):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AskedDrive:
-    """What to do with the robot.
+    """An episode that is asked for.
 
     Attributes:
         goal: identifier of a goal image that one of its cameras took.
         names: of the objects on its table.
         boxes: around the objects, by camera and name, if the robot delivers no masks [px].
         seed: of the searches.
-        settings: changes of the defaults, as of other episodes.
+        settings: what differs from the defaults, as in other episodes.
     """
 
     goal: str
@@ -78,15 +207,15 @@ class AskedDrive:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RobotNow:
-    """How the robot is.
+    """The state of the robot.
 
     Attributes:
         host: where it is; None if there is none.
         state: what it does.
         text: the same for a person, or what went wrong.
         episode: job that drives it, or did last.
-        limits: for its pusher: the service's, within its own once it has told them.
-        description: what it says of itself; None while it has not answered.
+        limits: of its pusher: the service's, and within them the robot's own once it has answered.
+        description: of itself; None while it has not answered.
     """
 
     host: str | None
@@ -98,7 +227,7 @@ class RobotNow:
 
 
 class RobotTable:
-    """The robot of one service, and in `pictures` what its cameras saw last. Any thread may call; all but `here` block.
+    """The robot of a service; `pictures` has what its cameras saw last. Any thread may call; all but `here` block.
 
     Args:
         settings: of the service: which robot, and its limits. No request can name another one.
@@ -121,15 +250,19 @@ class RobotTable:
         self._about: RobotDescription | None = None
         self._line: HttpRobot | None = None  # of its own, for stops and pictures; a stop waits for no picture
         self._connecting, self._ordering = threading.Lock(), threading.Lock()
+        self._lost: OsfError | None = None  # why it did not answer when it was last asked what it is
+        self._tried_at = 0.0  # when that was
         self._stopped: tuple[str, str] | None = None  # the job that was stopped, and why
         self._watched: tuple[str, float] | None = None  # the page that let it move, and when it was last heard of
         self._leave: Callable[[], None] = lambda: None
+        self._reader = PhotoReader()  # of its own: what a robot sends holds up nobody's photos
         self.pictures = RobotPictures(
-            lambda: self._described().cameras, self._taken, self._may_look, self._latest_folder
-        )
+            lambda: self._described().cameras, self._take, lambda file: self._reader.read(file).pixels,
+            self._may_look, self._latest_folder,
+        )  # fmt: skip
 
     def start(self) -> None:
-        """Forget what an earlier service was asked for: perhaps it had another robot."""
+        """Cancel what an earlier service was asked for: perhaps it had another robot."""
         for job in self._runner.jobs.live(KIND):
             with contextlib.suppress(OsfError):
                 self._runner.jobs.cancel(job.id)
@@ -144,9 +277,10 @@ class RobotTable:
         self._leave()
         if self._line is not None:
             self._line.close()
+        self._reader.stop()
 
     def now(self) -> RobotNow:
-        """How the robot is; connects to it if that has not come about yet."""
+        """Return the state of the robot; connect to it if that has not come about yet."""
         if self._url is None:
             return RobotNow(None)
         try:
@@ -170,8 +304,7 @@ class RobotTable:
         goal = self._goals.get(asked.goal)
         if goal.camera.name not in cameras:
             raise UnknownName("camera of the robot", goal.camera.name, cameras)
-        if len(set(asked.names)) != len(asked.names):
-            raise InvalidInput("objects", ", ".join(asked.names), "each named once")
+        check_unique("objects", asked.names, "each named once")
         self._fields.require(asked.names, "ours")
         params = {
             "url": self._url, "title": goal.name, "names": list(asked.names), "goal_camera": goal.camera.name,
@@ -210,30 +343,28 @@ class RobotTable:
         return self._now()
 
     def here(self, page: str) -> None:
-        """A page says that it is there; does not block."""
+        """Note that a page is there; does not block."""
         if self._watched is not None and self._watched[0] == page:
             self._watched = page, time.monotonic()
 
     def stop(self, reason: str) -> RobotNow:
         """Stop the robot, whatever it does, and as often as one likes.
 
-        It is told directly, and by the process that drives it, at the same time: neither waits for the other.
+        The service and the process that drives it stop it at the same time: neither waits for the other.
 
         Args:
             reason: why, as the end of the sentence "The robot was stopped: ...".
         """
-        told = threading.Thread(target=self._tell_to_stop, name="robot stop", daemon=True)
-        told.start()
+        sent = threading.Thread(target=self._send_stop, name="robot stop", daemon=True)
+        sent.start()
         job = self._live()
         if job is not None:
             if self._stopped is None or self._stopped[0] != job.id:
                 self._stopped = job.id, f"The robot was stopped: {reason}."
                 self._runner.hub.publish(Notice("warning", self._stopped[1]))
             threading.Thread(target=self._cancel, args=(job.id,), name="robot cancel", daemon=True).start()
-        told.join(_STOP_WAIT_S)
+        sent.join(_STOP_WAIT_S)
         return self._now()
-
-    # Inside
 
     def _cancel(self, job: str) -> None:
         why = self._stopped[1] if self._stopped is not None and self._stopped[0] == job else None
@@ -246,20 +377,42 @@ class RobotTable:
         return RobotNow(self._host, *self._state_of(job), job, limits, about)
 
     def _described(self) -> RobotDescription:
+        """Return what the robot says of itself.
+
+        One thread at a time asks for it. Others wait only if nobody has asked before, or a robot that does not answer
+        would soon have all of them wait.
+
+        Raises:
+            NoRobot: if there is none.
+            ConnectionLost, RobotRefused: if it does not answer.
+            InvalidInput: if what it says is out of range.
+        """
         if self._url is None:
             raise NoRobot
-        with self._connecting:
-            if self._about is None:
-                robot = connect(self._url, (), self._limits)
-                self._limits.within(robot.description.limits)
-                self._about = robot.description
-                if isinstance(robot, HttpRobot):
-                    self._line = robot
-                else:  # rosbridge would go on sending pictures
-                    robot.close()
-            return self._about
+        if self._about is None and self._connecting.acquire(blocking=self._lost is None):
+            try:
+                if self._about is None and (self._lost is None or time.monotonic() - self._tried_at >= FRESH_S):
+                    self._about = self._connect(self._url)
+            except OsfError as error:
+                self._lost, self._tried_at = error, time.monotonic()
+            finally:
+                self._connecting.release()
+        if self._about is None:
+            assert self._lost is not None
+            raise self._lost.with_traceback(None)
+        return self._about
 
-    def _tell_to_stop(self) -> None:
+    def _connect(self, url: str) -> RobotDescription:
+        robot = connect(url, (), self._limits)
+        with contextlib.ExitStack() as opened:
+            opened.callback(robot.close)
+            self._limits.within(robot.description.limits)
+            if isinstance(robot, HttpRobot):  # rosbridge would go on sending pictures
+                self._line = robot
+                opened.pop_all()
+        return robot.description
+
+    def _send_stop(self) -> None:
         if self._line is not None:
             with contextlib.suppress(OsfError):  # one that cannot be reached halts by itself
                 self._line.stop()
@@ -273,11 +426,11 @@ class RobotTable:
             time.sleep(self._lease_s / 10)
 
     def _hear(self, event: object) -> None:
-        """However an episode ends, even by the death of its process: the robot refuses motions from then on."""
+        """Stop the robot when an episode ends in whatever way, even by the death of its process."""
         if isinstance(event, JobChanged) and event.job.kind == KIND and event.job.is_finished:
-            threading.Thread(target=self._tell_to_stop, name="robot stop", daemon=True).start()
+            threading.Thread(target=self._send_stop, name="robot stop", daemon=True).start()
 
-    def _taken(self) -> tuple[bytes, ...]:
+    def _take(self) -> tuple[bytes, ...]:
         assert self._url is not None
         if self._line is not None:
             return self._line.pictures()
@@ -316,7 +469,7 @@ class RobotTable:
 
 
 def limits_of(settings: Settings) -> SafetyLimits:
-    """What the service lets a robot do.
+    """Return what the service lets a robot do.
 
     Raises:
         InvalidInput: if a limit makes no sense.
@@ -326,7 +479,7 @@ def limits_of(settings: Settings) -> SafetyLimits:
 
 
 def host_of(url: str) -> str:
-    """Where a robot is, for people: without names of topics, and without what nobody shall read.
+    """Return where a robot is, for people: without names of topics and passwords.
 
     Raises:
         InvalidInput: if it is no address of a robot.

@@ -1,1 +1,0 @@
-"""Episodes with a robot, of which nobody knows the truth."""

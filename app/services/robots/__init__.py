@@ -1,1 +1,0 @@
-"""The robot that a service may drive beside its simulated tables."""
