@@ -8,6 +8,7 @@ from pathlib import Path
 
 from app.processes.pictures.thumbnail_process import thumbnails_main
 from app.processes.process_client import ProcessClient, ProcessUnavailable
+from osfcore.errors import CannotWrite
 from osfcore.io.files import write_atomically
 from osfcore.objects.asset_library import AssetLibrary
 
@@ -54,8 +55,7 @@ class Thumbnails:
             with contextlib.suppress(OSError):  # another request may have drawn it meanwhile
                 return file.read_bytes()
             png = self._draw(name)
-        with contextlib.suppress(OSError):  # on a full disk it is drawn again the next time
-            self._cache.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(CannotWrite):  # on a full disk it is drawn again the next time
             write_atomically(file, png)
         return png
 
