@@ -17,8 +17,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from html import escape
 
-import viser
-
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged, SceneRecord
 from app.services.event_hub import CurrentScene
 from app.viewer.nodes.scene_nodes import Client, SceneNodes
@@ -127,14 +125,6 @@ class Panel(ABC):
         with self._thread.changed:
             if self._store(event):
                 self._thread.wake()
-
-    def add_client(self, client: viser.ClientHandle) -> None:
-        """A browser has connected."""
-        del client  # all browsers see the same
-
-    def remove_client(self, client: viser.ClientHandle) -> None:
-        """A browser has disconnected."""
-        del client
 
     def close(self) -> None:
         """End the thread. Calling it again does nothing."""

@@ -27,24 +27,7 @@ _BEHIND_M = 0.003  # pictures lie that much farther away, so that what stands on
 _JPEG_QUALITY = {False: 75, True: 92}  # by whether a picture is sharp
 _NEURAL = "neural pictures"
 _log = logging.getLogger(__name__)
-Seen = Callable[[int], tuple[SceneState, str]]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Answer:
-    """The answer to a rendering request.
-
-    Attributes:
-        ticket: of the request.
-        names: of the objects that are rendered.
-        root: of the nodes that they stand for.
-        future: the answer itself.
-    """
-
-    ticket: RenderTicket
-    names: tuple[str, ...]
-    root: str
-    future: Future[NeuralAnswer]
+Seen = Callable[[], tuple[SceneState, str]]
 
 
 class HiddenNodes:
@@ -171,18 +154,22 @@ class Refinement:
 
 
 class ClientView:
-    """One browser, and the picture on view. All but `is_on` belongs to the thread of `NeuralPanel`.
+    """One browser, and the picture on view. All but `hidden` and `is_on` belongs to the thread of `NeuralPanel`.
+
+    Args:
+        client: the browser.
+        seen: what it shows now, and the root of its nodes.
 
     Attributes:
         hidden: what this browser does not see, for whatever reason.
         is_on: whether neural pictures are switched on.
     """
 
-    def __init__(self, client: viser.ClientHandle) -> None:
-        self.client = client
+    def __init__(self, client: viser.ClientHandle, seen: Seen) -> None:
+        self.client, self.seen = client, seen
         self.is_on = False
         self.refinement = Refinement()
-        self.answers: list[_Answer] = []
+        self.answers: list[Callable[[], None]] = []  # what to do with those that have come
         self.waiting_since: float | None = None  # for a first picture
         self.hidden = HiddenNodes(client)
         self._waiting: viser.NotificationHandle | None = None
@@ -259,77 +246,74 @@ class ClientView:
 
 
 class NeuralPanel(Panel):
-    """The views of all browsers, and the thread that requests and shows their pictures.
+    """The views of browsers, and the thread that requests and shows their pictures.
 
     Args:
         link: to the renderer.
-        seen: what a browser, named by its number, shows now, and the root of its nodes.
         fields: names of the objects that have one.
         label: what people call an object.
     """
 
     def __init__(
-        self, link: ProcessClient, seen: Seen, fields: Callable[[], Collection[str]], label: Callable[[str], str] = str
+        self, link: ProcessClient, fields: Callable[[], Collection[str]], label: Callable[[str], str] = str
     ) -> None:
         super().__init__("neural-panel")
         self._label = label
         self._link = link
-        self._seen = seen
         self._fields = fields
-        self._views: dict[int, ClientView] = {}  # guarded by `_thread.changed`, with what belongs to them
+        self._views: list[ClientView] = []  # guarded by `_thread.changed`, with what belongs to them
 
-    def add_client(self, client: viser.ClientHandle) -> None:
-        """Look after a new browser."""
-        client.camera.on_update(lambda _: self.moved(client.client_id))
+    def add(self, client: viser.ClientHandle, seen: Seen) -> ClientView:
+        """Look after a new browser.
+
+        Args:
+            client: the browser.
+            seen: what it shows now, and the root of its nodes.
+        """
+        view = ClientView(client, seen)
+        client.camera.on_update(lambda _: self.moved(view))
         with self._thread.changed:
-            self._views[client.client_id] = ClientView(client)
+            self._views.append(view)
+        return view
 
-    def remove_client(self, client: viser.ClientHandle) -> None:
+    def remove(self, view: ClientView) -> None:
         """Forget a browser that has left."""
         with self._thread.changed:
-            self._views.pop(client.client_id, None)
+            self._views = [other for other in self._views if other is not view]
 
-    def hidden(self, client: int) -> HiddenNodes | None:
-        """What one browser does not see; None once it has left. Any thread may call."""
-        with self._thread.changed:
-            view = self._views.get(client)
-        return None if view is None else view.hidden
-
-    def switch(self, client: int, *, is_on: bool) -> None:
+    def switch(self, view: ClientView, *, is_on: bool) -> None:
         """Switch neural pictures on or off in one browser. Any thread may call."""
         with self._thread.changed:
-            view = self._views.get(client)
-            if view is not None and view.is_on != is_on:
+            if view.is_on != is_on:
                 view.is_on = is_on
-                self.moved(client)
+                self.moved(view)
 
-    def moved(self, client: int | None = None) -> None:
+    def moved(self, view: ClientView | None = None) -> None:
         """Note that what one browser shows has changed, or all; any thread may call, and never waits for a picture."""
         with self._thread.changing():
-            for view in self._views.values():
-                if client in (None, view.client.client_id):
-                    view.refinement.moved(time.monotonic())
+            for one in self._views if view is None else [view]:
+                one.refinement.moved(time.monotonic())
 
     def _draw(self) -> None:
         now = time.monotonic()
         with self._thread.changed:
-            due = [view for view in self._views.values() if (at := view.due_at()) is not None and at <= now]
+            due = [view for view in self._views if (at := view.due_at()) is not None and at <= now]
         for view in due:
             try:
                 self._look_after(view, now)
             except Exception:  # a defect; the other browsers still get their pictures
                 _log.exception("the neural pictures of a browser failed")
-                self.remove_client(view.client)
+                self.remove(view)
         with self._thread.changed:
-            times = [at for view in self._views.values() if (at := view.due_at()) is not None]
+            times = [at for view in self._views if (at := view.due_at()) is not None]
             if times:
                 self._thread.wake(max(min(times) - time.monotonic(), 0.0))
 
     def _look_after(self, view: ClientView, now: float) -> None:
         with self._thread.changed:
             answers, view.answers = view.answers, []
-        for answer in answers:
-            self._take(view, answer)
+        for take in answers:
+            take()
         if not view.is_on:
             view.clear()
             return
@@ -342,36 +326,34 @@ class NeuralPanel(Panel):
 
     def _order(self, view: ClientView, ticket: RenderTicket, now: float) -> None:
         step = STEPS[ticket.step]
-        seen, root = self._seen(view.client.client_id)
-        camera, (state, others) = view.camera(step.rows), self._split(seen)
+        (seen, root), camera = view.seen(), view.camera(step.rows)
         if camera is None:
             with self._thread.changed:
                 view.refinement.give_up(ticket)
             return
-        view.notify_meshes(tuple(self._label(name) for name in others))
+        known = self._fields()
+        rows = [row for row, name in enumerate(seen.names) if name in known]
+        names = tuple(seen.names[row] for row in rows)
+        view.notify_meshes(tuple(self._label(name) for name in seen.names if name not in known))
         if not self._link.is_warm and view.waiting_since is None:
             view.waiting_since = now
+        state = SceneState(names, seen.poses[rows], seen.light, seen.pusher)
+
+        def receive(done: Future[NeuralAnswer]) -> None:
+            with self._thread.changing():
+                view.answers.append(lambda: self._take(view, ticket, done, names, root))
+
         order = DrawView(f"view-{view.client.client_id}", state, camera, step.is_sharp)
-        future = self._link.submit(order)
-        future.add_done_callback(lambda done: self._receive(view, _Answer(ticket, state.names, root, done)))
+        self._link.submit(order).add_done_callback(receive)
 
-    def _split(self, state: SceneState) -> tuple[SceneState, tuple[str, ...]]:
-        """What can be rendered, and the names of the other objects."""
-        known = self._fields()
-        rows = [row for row, name in enumerate(state.names) if name in known]
-        others = tuple(name for name in state.names if name not in known)
-        names = tuple(state.names[row] for row in rows)
-        return SceneState(names, state.poses[rows], state.light, state.pusher), others
-
-    def _receive(self, view: ClientView, answer: _Answer) -> None:
-        with self._thread.changing():
-            view.answers.append(answer)
-
-    def _take(self, view: ClientView, answer: _Answer) -> None:
-        error = answer.future.exception()
-        picture = None if error else answer.future.result()
+    def _take(
+        self, view: ClientView, ticket: RenderTicket, answer: Future[NeuralAnswer], names: tuple[str, ...], root: str
+    ) -> None:
+        """Show a picture of some objects, which stand below a root, unless it is overtaken."""
+        error = answer.exception()
+        picture = None if error else answer.result()
         with self._thread.changed:
-            is_current = view.refinement.accept(answer.ticket, is_there=picture is not None)
+            is_current = view.refinement.accept(ticket, is_there=picture is not None)
         if not view.is_on:
             return
         if isinstance(error, OsfError):
@@ -379,4 +361,4 @@ class NeuralPanel(Panel):
         elif error is not None:
             raise error
         elif is_current and isinstance(picture, DrawnView):
-            view.show(picture, answer.names, answer.root)
+            view.show(picture, names, root)

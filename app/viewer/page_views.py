@@ -71,35 +71,42 @@ class Wish:
 
 
 class _View:
-    """A browser that shows the view of a page. All but `client` belongs to the thread that draws.
+    """A browser that shows the view of a page. All but `client` and `picture` belongs to the thread that draws.
+
+    Args:
+        client: the browser.
+        neural: makes its neural pictures.
+        live: what is on the live table now.
 
     Attributes:
-        client: the browser.
+        picture: the neural picture, and what the browser does not see.
         nodes: the replay that it shows in place of the live table.
-        shown: the file that they replay, and when it was last written.
     """
 
-    def __init__(self, client: viser.ClientHandle) -> None:
+    def __init__(self, client: viser.ClientHandle, neural: NeuralPanel, live: Callable[[], SceneState]) -> None:
         self.client = client
         self.nodes: ReplayNodes | None = None
-        self.shown: tuple[Path, int] | None = None
+        self._shown: tuple[Path, int] | None = None  # the file that they replay, and when it was last written
+        self.picture = neural.add(
+            client, lambda: (live(), "") if (nodes := self.nodes) is None else (nodes.state(), _ROOT)
+        )
 
     def opened(self, trajectory: Path, library: AssetLibrary) -> ReplayNodes:
         """Make the nodes for a trajectory, or keep them; an episode that goes on is read again once there is more."""
         version = trajectory, trajectory.stat().st_mtime_ns
-        if self.nodes is None or self.shown is None or self.shown[0] != trajectory:
+        if self.nodes is None or self._shown is None or self._shown[0] != trajectory:
             self.close()
             self.nodes = ReplayNodes(self.client, library, read_trajectory(trajectory))
-        elif self.shown != version:
+        elif self._shown != version:
             self.nodes.follow(read_trajectory(trajectory))
-        self.shown = version
+        self._shown = version
         return self.nodes
 
     def close(self) -> None:
         """Show the live table again."""
         if self.nodes is not None:
             self.nodes.remove()
-        self.nodes = self.shown = None
+        self.nodes = self._shown = None
 
 
 @dataclass(slots=True)
@@ -145,7 +152,7 @@ class PageViews(Panel):
         self._library = library
         self._page_of = page_of
         self._live = live
-        self.neural = NeuralPanel(link, self.seen, fields, library.label)
+        self.neural = NeuralPanel(link, fields, library.label)
         self._pages: OrderedDict[str, _Page] = OrderedDict()  # guarded by `_thread.changed`, the newest wish last
 
     def ask(self, page: str, wish: Wish) -> bool:
@@ -172,22 +179,17 @@ class PageViews(Panel):
         if page is not None:
             with self._thread.changing():
                 known = self._page(page)
-                known.view, known.is_due = _View(client), True
+                if known.view is not None:  # reloaded, and not known yet to have left
+                    self.neural.remove(known.view.picture)
+                known.view, known.is_due = _View(client, self.neural, self._live), True
 
     def remove_client(self, client: viser.ClientHandle) -> None:
         """Forget a browser that has left; what its page has asked for is remembered."""
         with self._thread.changed:
             for known in self._pages.values():
                 if known.view is not None and known.view.client is client:
+                    self.neural.remove(known.view.picture)
                     known.view = None
-
-    def seen(self, client: int) -> tuple[SceneState, str]:
-        """Look up what a browser shows now, and the root of its nodes. Any thread may call."""
-        with self._thread.changed:
-            for page in self._pages.values():
-                if page.view is not None and page.view.client.client_id == client and page.view.nodes is not None:
-                    return page.view.nodes.state(), _ROOT
-        return self._live(), ""
 
     def _page(self, name: str) -> _Page:
         """Remember a page, and no longer those without a view that were heard of longest ago."""
@@ -220,12 +222,10 @@ class PageViews(Panel):
             self._draw_replay(page, view, wish.replay, time.monotonic() - since)
         else:
             view.close()
-        root, client = _ROOT if wish.replay is not None else "", view.client.client_id
-        hidden = self.neural.hidden(client)
-        if hidden is not None:
-            hidden.hide("page", {f"{root}{path}" for path in _HIDDEN[wish.shows]})
-        self.neural.switch(client, is_on=wish.shows == "fields")
-        self.neural.moved(client)
+        root = _ROOT if wish.replay is not None else ""
+        view.picture.hidden.hide("page", {f"{root}{path}" for path in _HIDDEN[wish.shows]})
+        self.neural.switch(view.picture, is_on=wish.shows == "fields")
+        self.neural.moved(view.picture)
 
     def _draw_replay(self, page: _Page, view: _View, wish: Replay, since_s: float) -> None:
         nodes = view.opened(wish.trajectory, self._library)

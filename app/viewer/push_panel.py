@@ -44,16 +44,6 @@ class CannotExecute(OsfError):
     """Actions that may not be executed now."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Request:
-    """A requested prediction and, once it is there, its answer."""
-
-    record: SceneRecord
-    actions: Float[np.ndarray, "T 3"]
-    client: Client
-    answer: Future[NeuralAnswer]
-
-
 class PushPanel(Panel):
     """The folder and the nodes of predicted pushes; the same in all browsers.
 
@@ -82,7 +72,7 @@ class PushPanel(Panel):
         self._record: SceneRecord | None = None
         self._prediction: PushPrediction | None = None
         self._drawn: PushPrediction | None = None
-        self._answered: _Request | None = None
+        self._take_answer: Callable[[], None] | None = None  # what to do with one that has come
         self._message = _IDLE
         self._executing: PushPrediction | None = None
         self._has_plan = False  # whether anybody has begun to choose a push
@@ -144,12 +134,12 @@ class PushPanel(Panel):
         with self._thread.changing():
             self._has_plan = True
             self._message = "Predicting" if is_warm else "Loading the network, some seconds the first time"
-        request = _Request(record, actions, client, answer)
-        answer.add_done_callback(lambda _: self._note_answer(request))
 
-    def _note_answer(self, request: _Request) -> None:
-        with self._thread.changing():
-            self._answered = request
+        def receive(done: Future[NeuralAnswer]) -> None:
+            with self._thread.changing():
+                self._take_answer = lambda: self._take(done, record, actions, client)
+
+        answer.add_done_callback(receive)
 
     def _execute(self) -> None:
         with self._thread.changing():
@@ -175,9 +165,9 @@ class PushPanel(Panel):
 
     def _draw(self) -> None:
         with self._thread.changed:
-            answered, self._answered = self._answered, None
-        if answered is not None:
-            self._take(answered)
+            take, self._take_answer = self._take_answer, None
+        if take is not None:
+            take()
         with self._thread.changed:
             record, prediction, message = self._record, self._prediction, self._message
         is_executed = prediction is not None and prediction.is_executed
@@ -198,28 +188,27 @@ class PushPanel(Panel):
         if self._execute_button.disabled != is_idle:
             self._execute_button.disabled = is_idle
 
-    def _take(self, request: _Request) -> None:
+    def _take(
+        self, answer: Future[NeuralAnswer], record: SceneRecord, actions: Float[np.ndarray, "T 3"], client: Client
+    ) -> None:
         """Make an answer what is on view, unless the table has changed meanwhile."""
-        error = request.answer.exception()
-        answer = None if error else request.answer.result()
-        if isinstance(error, OsfError):
-
-            def refuse(error: OsfError = error) -> None:
-                raise error
-
+        try:
+            predicted = answer.result()
+        except OsfError as error:
             self._say(str(error))
-            self._run_command(refuse, request.client)
-        elif error is not None:
+            self._run_command(answer.result, client)  # which notifies of the same
+            return
+        except Exception:
             self._say("The prediction failed; the log tells more")
-            raise error
+            raise
         with self._thread.changed:
-            now = self._record
-            if not isinstance(answer, Predicted):  # overtaken by a newer request
+            if not isinstance(predicted, Predicted):  # overtaken by a newer request
                 return
-            if now is None or (now.id, now.revision) != (request.record.id, request.record.revision):
+            now = self._record
+            if now is None or (now.id, now.revision) != (record.id, record.revision):
                 self._message = _CHANGED
                 return
-            self._prediction = PushPrediction(request.record, request.actions, answer.rollouts, answer.took_s)
+            self._prediction = PushPrediction(record, actions, predicted.rollouts, predicted.took_s)
 
     def _draw_plan(self, record: SceneRecord | None, *, is_executed: bool) -> None:
         path = None

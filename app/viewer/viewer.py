@@ -145,13 +145,11 @@ class Viewer:
 
     def _add_client(self, client: viser.ClientHandle) -> None:
         self._runner.watch_frames(1)
-        for panel in self._panels:
-            panel.add_client(client)
+        self.pages.add_client(client)
 
     def _remove_client(self, client: viser.ClientHandle) -> None:
         self._runner.watch_frames(-1)
-        for panel in self._panels:
-            panel.remove_client(client)
+        self.pages.remove_client(client)
         self._memory.wake(_AFTER_LEAVING_S)
 
     def _show_current(self) -> None:

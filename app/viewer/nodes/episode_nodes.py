@@ -12,23 +12,9 @@ from jaxtyping import Float, UInt8
 
 from app.processes.plan_summary import PlanSketch
 from app.viewer.nodes.estimate_nodes import EstimateNodes
-from app.viewer.nodes.ghosts import (
-    FINE_CELLS,
-    PREDICTED,
-    add_ghosts,
-    add_pusher_ghost,
-    along_way,
-    below_table,
-    between,
-    mesh_of,
-    move_ghosts,
-    moves,
-    pose_at,
-    way_of,
-)
+from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of
 from app.viewer.nodes.room import NO_LINES, Colour, Label, Target, atomic
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.objects.asset_library import AssetLibrary
 
@@ -74,7 +60,7 @@ class EpisodeNodes:
             server, library, names, root=f"{root}/goal/look", colour=_linear(GOAL), has_light=False
         )
         self._goal: dict[str, viser.MeshHandle] = {}
-        self._future = FutureNodes(server.scene, library, f"{root}/plan/future")
+        self._future = FutureNodes(server.scene, library, f"{root}/plan/future", FutureStyle(_linear(PREDICTED)))
         add = self._scene.add_line_segments
         # Lines that begin in one colour for all would stay white once each has its own.
         each = np.array([[_linear(CHEAP)] * 2], np.uint8)
@@ -202,71 +188,3 @@ def _linear(colour: Colour) -> Colour:
 
 def _segments(ways: Float[np.ndarray, "W T1 3"]) -> Float[np.ndarray, "S 2 3"]:
     return np.stack([ways[:, :-1], ways[:, 1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
-
-
-# The future that a plan predicts
-
-ON_THE_WAY = 3  # pale ghosts between now and the end
-_ARM_M = 0.05  # what turning by 1 rad counts on the way
-_OPACITY, _PALE = 0.45, 0.3  # the latter is a share of the former
-_SCALE = 1.008  # or ghosts and the surfaces below them would flicker
-
-
-class FutureNodes:
-    """One future of the objects that move in it: ghosts on the way, at its end, and moving with the pusher.
-
-    Args:
-        scene: to draw in.
-        library: meshes of the objects.
-        root: of its nodes.
-    """
-
-    def __init__(self, scene: viser.SceneApi, library: AssetLibrary, root: str) -> None:
-        self._scene = scene
-        self._library = library
-        self._root = root
-        self._future: Rollouts | None = None
-        self._ghosts: dict[str, viser.BatchedMeshHandle] = {}
-        self._pusher = add_pusher_ghost(scene, f"{root}/pusher")
-
-    @property
-    def steps(self) -> int:
-        """Actions until its end; 0 while none is shown."""
-        return 0 if self._future is None else len(self._future.pusher[0]) - 1
-
-    def show(self, future: Rollouts | None) -> None:
-        """Show the first of some rollouts, from its beginning, in place of the one before."""
-        self._future = future
-        self._pusher.visible = future is not None
-        if future is None:
-            for node in self._ghosts.values():
-                node.visible = False
-            return
-        if set(future.names) != set(self._ghosts):
-            for node in self._ghosts.values():
-                node.remove()
-            self._ghosts = {name: self._add_ghosts(name) for name in future.names}
-        for n, name in enumerate(future.names):
-            self._ghosts[name].visible = moves(way_of(future, n))
-        self.at(0.0)
-
-    def at(self, step: float) -> None:
-        """Move the ghosts that go along to where things are after some actions; in between, halfway."""
-        future = self._future
-        if future is None:
-            return
-        for n, name in enumerate(future.names):
-            if self._ghosts[name].visible:
-                poses = way_of(future, n)
-                now = pose_at(poses, step)
-                still = poses[[*along_way(poses, ON_THE_WAY, _ARM_M), -1]]
-                positions = np.vstack([still.position, now.position])
-                move_ghosts(self._ghosts[name], Pose(positions, np.vstack([still.quaternion, now.quaternion])))
-        self._pusher.position = between(future.pusher[0], step)
-
-    def _add_ghosts(self, name: str) -> viser.BatchedMeshHandle:
-        """Add ghosts of one object: on the way, at the end, and the one that goes."""
-        mesh, places = mesh_of(self._library, name, FINE_CELLS), below_table(ON_THE_WAY + 2)
-        shares = np.array([*[_PALE] * ON_THE_WAY, 1.0, 1.0])
-        path, colour = f"{self._root}/{name}", _linear(PREDICTED)
-        return add_ghosts(self._scene, path, mesh, places, colour, _OPACITY, scale=_SCALE, shares=shares)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -19,7 +20,9 @@ CELLS, FINE_CELLS = 14, 28  # along the longest side of an object; a coarse ghos
 PREDICTED, TRUE = (190, 50, 210), (25, 25, 25)  # neither is a colour of estimates
 UNKNOWN_M = 0.05  # the side of the cube for an object without a mesh
 _ARC_STEPS = 24
-_PUSHER_SCALE, _PUSHER_OPACITY = 1.01, 0.35
+_PUSHER_OPACITY = 0.35
+_SCALE = 1.008  # or ghosts and the surfaces below them would flicker
+_ARM_M = 0.05  # what turning by 1 rad counts on a way
 MOVED_M, _TURNED = 5e-4, 1e-3
 _log = logging.getLogger(__name__)
 Mesh = tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 3"]]
@@ -114,20 +117,6 @@ def add_ghosts(
     )
 
 
-def add_pusher_ghost(scene: viser.SceneApi, path: str) -> viser.CylinderHandle:
-    """Add a ghost of the pusher, hidden until it has somewhere to be."""
-    return scene.add_cylinder(
-        path,
-        radius=PUSHER_RADIUS_M * _PUSHER_SCALE,
-        height=PUSHER_HEIGHT_M,
-        color=PREDICTED,
-        opacity=_PUSHER_OPACITY,
-        cast_shadow=False,
-        receive_shadow=False,
-        visible=False,
-    )
-
-
 def move_ghosts(node: viser.BatchedMeshHandle, poses: Pose) -> None:
     """Move the copies of a node to a batch of poses (N,)."""
     node.batched_positions = poses.position.astype(np.float32)
@@ -191,17 +180,16 @@ def between(rows: Float[np.ndarray, "T C"], step: float) -> Float[np.ndarray, "C
     return rows[before] + (step - before) * (rows[after] - rows[before])
 
 
-def along_way(poses: Pose, count: int, arm_m: float = 0.0) -> list[int]:
+def along_way(poses: Pose, count: int) -> list[int]:
     """Choose rows that lie about evenly along a way, not in time: most futures begin with a gap.
 
     Args:
         poses: on the way, a batch (T,).
         count: of rows; some may be equal.
-        arm_m: what turning by 1 rad counts on the way [m].
     """
     shifts = np.linalg.norm(np.diff(poses.position, axis=0), axis=1)
     turns = rotation_angle(poses.quaternion[:-1], poses.quaternion[1:])
-    gone = np.cumsum(shifts + arm_m * turns)
+    gone = np.cumsum(shifts + _ARM_M * turns)
     rows = np.searchsorted(gone, gone[-1] * np.arange(1, count + 1) / (count + 1))
     return [min(int(row) + 1, len(gone)) for row in rows]
 
@@ -229,3 +217,100 @@ def heading_rad(quaternion: Float[np.ndarray, "4"]) -> float:
     axes = rotate(quaternion, np.eye(3))
     x, y, _ = axes[int(np.abs(axes[:, 2]).argmin())]
     return float(np.arctan2(y, x))
+
+
+# Predicted futures
+
+
+@dataclass(frozen=True, slots=True)
+class FutureStyle:
+    """How the ghosts of a future look.
+
+    Attributes:
+        colour: of all.
+        opacity: of the one that goes along.
+        on_the_way: how many pale ones there are between now and the end.
+        pale: share of the opacity that these have.
+        has_end: whether one stands at the end all the time.
+    """
+
+    colour: Colour
+    opacity: float = 0.45
+    on_the_way: int = 3
+    pale: float = 0.3
+    has_end: bool = True
+
+
+class FutureNodes:
+    """One future of the objects that move in it: ghosts on the way, at its end, and moving with the pusher.
+
+    Args:
+        scene: to draw in.
+        library: meshes of the objects.
+        root: of its nodes.
+        style: how the ghosts look.
+    """
+
+    def __init__(self, scene: viser.SceneApi, library: AssetLibrary, root: str, style: FutureStyle) -> None:
+        self._scene = scene
+        self._library = library
+        self._root, self._style = root, style
+        self._future: Rollouts | None = None
+        self._ghosts: dict[str, viser.BatchedMeshHandle] = {}
+        self._pusher = scene.add_cylinder(
+            f"{root}/pusher",
+            radius=PUSHER_RADIUS_M * _SCALE,
+            height=PUSHER_HEIGHT_M,
+            color=PREDICTED,
+            opacity=_PUSHER_OPACITY,
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=False,
+        )
+
+    @property
+    def steps(self) -> int:
+        """Actions until its end; 0 while none is shown."""
+        return 0 if self._future is None else len(self._future.pusher[0]) - 1
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Objects that move in it."""
+        return tuple(name for name, node in self._ghosts.items() if node.visible)
+
+    def show(self, future: Rollouts | None) -> None:
+        """Show the first of some rollouts, from its beginning, in place of the one before."""
+        self._future = future
+        self._pusher.visible = future is not None
+        if future is None:
+            for node in self._ghosts.values():
+                node.visible = False
+            return
+        if set(future.names) != set(self._ghosts):
+            for node in self._ghosts.values():
+                node.remove()
+            self._ghosts = {name: self._add_ghosts(name) for name in future.names}
+        for n, name in enumerate(future.names):
+            self._ghosts[name].visible = moves(way_of(future, n))
+        self.at(0.0)
+
+    def at(self, step: float) -> None:
+        """Move the ghosts that go along to where things are after some actions; in between, halfway."""
+        future = self._future
+        if future is None:
+            return
+        for n, name in enumerate(future.names):
+            if self._ghosts[name].visible:
+                poses = way_of(future, n)
+                now = pose_at(poses, step)
+                still = poses[[*along_way(poses, self._style.on_the_way), *[-1] * self._style.has_end]]
+                positions = np.vstack([still.position, now.position])
+                move_ghosts(self._ghosts[name], Pose(positions, np.vstack([still.quaternion, now.quaternion])))
+        self._pusher.position = between(future.pusher[0], step)
+
+    def _add_ghosts(self, name: str) -> viser.BatchedMeshHandle:
+        style = self._style
+        shares = np.array([*[style.pale] * style.on_the_way, *[1.0] * style.has_end, 1.0])
+        path, mesh = f"{self._root}/{name}", mesh_of(self._library, name, FINE_CELLS)
+        places = below_table(len(shares))
+        return add_ghosts(self._scene, path, mesh, places, style.colour, style.opacity, scale=_SCALE, shares=shares)

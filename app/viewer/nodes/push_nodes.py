@@ -3,29 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.nodes.ghosts import (
-    FINE_CELLS,
-    MOVED_M,
-    PREDICTED,
-    TRUE,
-    Mesh,
-    add_ghosts,
-    add_pusher_ghost,
-    along_way,
-    between,
-    mesh_of,
-    move_ghosts,
-    moves,
-    pose_at,
-    top_m,
-    way_of,
-)
+from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, TRUE, FutureNodes, FutureStyle, mesh_of, moves, top_m, way_of
 from app.viewer.nodes.room import NO_LINES, atomic
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
@@ -34,8 +18,7 @@ from osfcore.geometry.workspace import PUSHER_REACH_M
 from osfcore.objects.asset_library import AssetLibrary
 
 TRAIL = 5  # pale ghosts between start and end
-_GHOST_OPACITY, _TRAIL_OPACITY = 0.5, 0.13
-_GHOST_SCALE, _TRAIL_SCALE = 1.01, 1.005  # or ghosts and the surface below them would flicker
+_STYLE = FutureStyle(PREDICTED, opacity=0.5, on_the_way=TRAIL, pale=0.26, has_end=False)
 _ABOVE_M = 0.012  # ways of objects are drawn above them, that of the pusher above the table
 _FLOOR_M = 0.004
 _LINE_M = 0.004
@@ -51,24 +34,19 @@ class PushNodes:
 
     def __init__(self, server: viser.ViserServer, library: AssetLibrary) -> None:
         self._server = server
-        self._scene = server.scene
         self._library = library
         self._lock = threading.RLock()
-        self._meshes: dict[str, Mesh] = {}  # of what is on view; objects may be removed, and come back
-        self._rollouts: Rollouts | None = None
         self._step = 0.0
-        self._ghosts: dict[str, viser.BatchedMeshHandle] = {}
-        self._trails: list[viser.SceneNodeHandle] = []
-        add = self._scene.add_line_segments
+        self._future = FutureNodes(server.scene, library, "/push/future", _STYLE)
+        add = server.scene.add_line_segments
         self._plan = add("/push/plan", NO_LINES, PREDICTED, thickness=0.006, visible=False)
         self._ways = add("/push/ways", NO_LINES, PREDICTED, thickness=_LINE_M, visible=False)
         self._true_ways = add("/push/true_ways", NO_LINES, TRUE, thickness=_LINE_M, visible=False)
-        self._pusher = add_pusher_ghost(self._scene, "/push/pusher")
 
     @property
     def moving(self) -> tuple[str, ...]:
         """Objects that are predicted to move."""
-        return tuple(self._ghosts)
+        return self._future.moving
 
     def plan(self, places: Float[np.ndarray, "P 2"] | None) -> None:
         """Show the way of the pusher on the table [m], or none."""
@@ -79,79 +57,44 @@ class PushNodes:
     def show(self, rollouts: Rollouts) -> None:
         """Show the first of some rollouts in place of the one before, at its end."""
         with self._lock, atomic(self._server):
-            self._remove()
-            self._rollouts = rollouts
-            lines = []
-            for n, name in enumerate(rollouts.names):
-                poses = way_of(rollouts, n)
-                if moves(poses):
-                    lines.append(self._add_object(name, poses))
-            _draw(self._ways, lines)
-            self._pusher.visible = True
-            self._at(len(rollouts.pusher[0]) - 1.0)
+            self._true_ways.visible = False
+            self._future.show(rollouts)
+            self._step = len(rollouts.pusher[0]) - 1.0
+            self._future.at(self._step)
+            self._draw_ways(self._ways, {name: way_of(rollouts, n) for n, name in enumerate(rollouts.names)})
 
     def at(self, step: float) -> None:
         """Move the ghosts to where things are after some actions; in between, halfway."""
         with self._lock:
             if step != self._step:
+                self._step = step
                 with atomic(self._server):
-                    self._at(step)
+                    self._future.at(step)
 
     def show_truth(self, states: Sequence[SceneState]) -> None:
         """Show the ways that predicted objects, and others that moved, went in the simulation."""
         with self._lock, atomic(self._server):
-            lines = []
+            ways = {}
             for name in states[0].names if states else ():
-                poses = Pose(
-                    np.array([state.pose(name).position for state in states]),
-                    np.array([state.pose(name).quaternion for state in states]),
-                )
-                if moves(poses):
-                    lines.append(self._way(name, poses))
-            _draw(self._true_ways, lines)
+                poses = [state.pose(name) for state in states]
+                ways[name] = Pose(np.array([p.position for p in poses]), np.array([p.quaternion for p in poses]))
+            self._draw_ways(self._true_ways, ways)
 
     def clear(self) -> None:
         """Remove the prediction and the truth beside it; the plan stays."""
         with self._lock, atomic(self._server):
-            self._remove()
-            self._pusher.visible = self._ways.visible = self._true_ways.visible = False
+            self._future.show(None)
+            self._ways.visible = self._true_ways.visible = False
 
-    def _remove(self) -> None:
-        for node in (*self._ghosts.values(), *self._trails):
-            node.remove()
-        self._rollouts, self._ghosts, self._trails, self._meshes = None, {}, [], {}
-        self._true_ways.visible = False
-
-    def _add_object(self, name: str, poses: Pose) -> np.ndarray:
-        """Add ghost and trail of an object; returns the line of its way (T, 3) [m]."""
-        scene, mesh = self._scene, self._mesh(name)
-        gone_m = float(np.linalg.norm(np.diff(poses.position, axis=0), axis=1).sum())
-        rows = sorted({row for row in along_way(poses, TRAIL) if row < len(poses.position) - 1})
-        if gone_m > MOVED_M and rows:
-            path, pale = f"/push/trail/{name}", poses[rows]
-            self._trails.append(add_ghosts(scene, path, mesh, pale, PREDICTED, _TRAIL_OPACITY, scale=_TRAIL_SCALE))
-        path = f"/push/ghost/{name}"
-        self._ghosts[name] = add_ghosts(scene, path, mesh, poses[-1:], PREDICTED, _GHOST_OPACITY, scale=_GHOST_SCALE)
-        return self._way(name, poses)
-
-    def _at(self, step: float) -> None:
-        if self._rollouts is None:
-            return
-        self._step = step
-        for name, node in self._ghosts.items():
-            pose = pose_at(way_of(self._rollouts, self._rollouts.names.index(name)), step)
-            move_ghosts(node, Pose(pose.position[None], pose.quaternion[None]))
-        self._pusher.position = between(self._rollouts.pusher[0], step)
-
-    def _way(self, name: str, poses: Pose) -> np.ndarray:
-        """Compute the way of an object's centre, as high as the object was at the start, so that it stays in view."""
-        height_m = top_m(self._mesh(name)[0], poses.quaternion[0]) + _ABOVE_M
-        return poses.position + np.array([0.0, 0.0, height_m])
-
-    def _mesh(self, name: str) -> Mesh:
-        if name not in self._meshes:
-            self._meshes[name] = mesh_of(self._library, name, FINE_CELLS)
-        return self._meshes[name]
+    def _draw_ways(self, node: viser.LineSegmentsHandle, ways: Mapping[str, Pose]) -> None:
+        """Draw the ways of objects' centres, as high as they were at the start, so that they stay in view."""
+        lines = []
+        for name, poses in ways.items():
+            if moves(poses):
+                vertices, _ = mesh_of(self._library, name, FINE_CELLS)
+                height_m = top_m(vertices, poses.quaternion[0]) + _ABOVE_M
+                lines.append(poses.position + np.array([0.0, 0.0, height_m]))
+        _draw(node, lines)
 
 
 def _draw(node: viser.LineSegmentsHandle, lines: Sequence[np.ndarray]) -> None:

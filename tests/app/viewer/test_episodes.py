@@ -13,18 +13,9 @@ from app.processes.plan_summary import PlanSketch
 from app.services.event_hub import CurrentScene
 from app.services.goals.goals import Draft, DraftChanged
 from app.viewer.job_panels import EPISODE_INTERVAL_S, EpisodePanel
-from app.viewer.nodes.episode_nodes import (
-    GOAL,
-    ON_THE_WAY,
-    PARTS,
-    PLAY_S,
-    REST_S,
-    EpisodeNodes,
-    FutureNodes,
-    cost_colours,
-)
+from app.viewer.nodes.episode_nodes import GOAL, PARTS, PLAY_S, REST_S, EpisodeNodes, cost_colours
 from app.viewer.nodes.estimate_nodes import TRACKED
-from app.viewer.nodes.ghosts import along_way
+from app.viewer.nodes.ghosts import FutureNodes, FutureStyle, along_way
 from app.viewer.nodes.room import AT
 from app.viewer.nodes.scene_nodes import SceneNodes
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Look, Looking, Stepped
@@ -220,7 +211,7 @@ def test_one_way_that_goes_badly_wrong_does_not_paint_the_others_green():
 
 @pytest.fixture
 def future(server, library):
-    return FutureNodes(server.scene, library, "/future")
+    return FutureNodes(server.scene, library, "/future", FutureStyle((190, 50, 210)))
 
 
 def test_what_moves_is_drawn_at_its_end_paler_on_the_way_and_once_more_where_it_begins(future, driver):
@@ -229,11 +220,11 @@ def test_what_moves_is_drawn_at_its_end_paler_on_the_way_and_once_more_where_it_
     assert box.visible
     assert not can.visible  # it stays
     x = box.batched_positions[:, 0]
-    assert len(x) == ON_THE_WAY + 2
+    assert len(x) == FutureStyle((0, 0, 0)).on_the_way + 2
     assert np.all(np.diff(x[:-1]) > 0)
     assert x[0] > 0.01
     np.testing.assert_allclose(x[-2:], [0.1, 0.0], atol=1e-6)
-    assert np.all(box.batched_opacities[:ON_THE_WAY] < box.batched_opacities[-1])
+    assert np.all(box.batched_opacities[:3] < box.batched_opacities[-1])
     future.show(sketch(goes_m=0.0).best)
     assert driver.node(f"/future/{BOX}") is box
     assert not box.visible
@@ -265,13 +256,13 @@ def test_another_scene_has_other_ghosts(future, driver):
 def test_ghosts_on_the_way_are_spread_over_the_way_and_not_over_the_wait():
     x = 0.02 * np.maximum(np.arange(11) - 6, 0)
     waits = Pose(np.stack([x, 0 * x, 0 * x], axis=1), np.tile(TURNS[0], (11, 1)))
-    rows = along_way(waits, 3, 0.05)
+    rows = along_way(waits, 3)
     assert rows == sorted(rows)
     assert x[rows].min() > 0.01
     angles = np.linspace(0, 1, 11)
     turns = Pose(np.zeros((11, 3)), quaternion_exp(angles[:, None] * np.array([0, 0, 1.0])))
-    np.testing.assert_allclose(angles[along_way(turns, 3, 0.05)], [0.25, 0.5, 0.75], atol=0.1)
-    assert along_way(waits[:2], 3, 0.05) == [1, 1, 1]
+    np.testing.assert_allclose(angles[along_way(turns, 3)], [0.25, 0.5, 0.75], atol=0.1)
+    assert along_way(waits[:2], 3) == [1, 1, 1]
 
 
 def job(state: State = "running", scene="s", name="a", **changes):

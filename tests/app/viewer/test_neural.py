@@ -97,7 +97,7 @@ class Room:
         self.fields = {A, B}
         self.light = Light(np.array([0, 0, 1.0]))
         self.renderer = Renderer()
-        self.panel = NeuralPanel(self.renderer, lambda _: (self.state(), ""), lambda: self.fields, "the {}".format)
+        self.panel = NeuralPanel(self.renderer, lambda: self.fields, "the {}".format)
 
     def state(self):
         poses = Pose(np.array([[0, 0, 0.1], [0.1, 0, 0.1]]), np.array([[1.0, 0, 0, 0]] * 2))
@@ -116,14 +116,14 @@ def room():
 @pytest.fixture
 def browser(room):
     browser = Browser()
-    room.panel.add_client(browser)
+    browser.view = room.panel.add(browser, lambda: (room.state(), ""))
     return browser
 
 
 def test_pictures_get_sharper_and_replace_the_meshes_until_switched_off(room, browser):
     room.panel.moved()
     assert room.renderer.orders == []  # nobody asked
-    room.panel.switch(browser.client_id, is_on=True)
+    room.panel.switch(browser.view, is_on=True)
     orders = [room.renderer.answer(number) for number in range(3)]
     assert [order.camera.height for order in orders] == [112, 256, 480]
     assert [order.is_sharp for order in orders] == [False, True, True]
@@ -134,7 +134,7 @@ def test_pictures_get_sharper_and_replace_the_meshes_until_switched_off(room, br
     assert image.shape == (480, 720, 3)
     assert (depth == 100).all()  # a picture of nothing hides nothing
     assert browser.pictures[0][1] is None
-    room.panel.switch(browser.client_id, is_on=False)
+    room.panel.switch(browser.view, is_on=False)
     until(lambda: browser.pictures[-1][0] is None)
     assert browser.hides() == set()
     assert len(room.renderer.orders) == 3
@@ -142,7 +142,7 @@ def test_pictures_get_sharper_and_replace_the_meshes_until_switched_off(room, br
 
 def test_meshes_stay_until_the_first_picture(room, browser):
     room.renderer.is_warm = False
-    room.panel.switch(browser.client_id, is_on=True)
+    room.panel.switch(browser.view, is_on=True)
     until(lambda: browser.notifications)
     assert "loading" in browser.notifications[0].body
     assert browser.hides() == set()
@@ -152,7 +152,7 @@ def test_meshes_stay_until_the_first_picture(room, browser):
 
 
 def test_the_light_and_the_view_are_followed(room, browser):
-    room.panel.switch(browser.client_id, is_on=True)
+    room.panel.switch(browser.view, is_on=True)
     room.renderer.answer(0)
     room.light = Light(np.array([1.0, 0, 0.5]))
     room.panel.moved()
@@ -167,7 +167,7 @@ def test_the_light_and_the_view_are_followed(room, browser):
 
 def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
     room.fields = {B}
-    room.panel.switch(browser.client_id, is_on=True)
+    room.panel.switch(browser.view, is_on=True)
     order = room.renderer.answer(0)
     assert order.state.names == (B,)
     np.testing.assert_allclose(order.state.poses.position, [[0.1, 0, 0.1]], atol=1e-12)
@@ -180,7 +180,7 @@ def test_objects_without_a_field_stay_meshes_and_are_named(room, browser):
 
 
 def test_where_the_renderer_fails_the_switch_goes_back_and_says_why(room, browser):
-    room.panel.switch(browser.client_id, is_on=True)
+    room.panel.switch(browser.view, is_on=True)
     room.renderer.answer(0, ProcessUnavailable("neural renderer", "stopped unexpectedly"))
     until(lambda: browser.notifications)
     assert "stopped unexpectedly" in browser.notifications[0].body
@@ -191,7 +191,7 @@ def test_where_the_renderer_fails_the_switch_goes_back_and_says_why(room, browse
 
 def test_a_view_that_makes_no_sense_is_left_alone_until_it_does(room, browser):
     browser.camera.aspect = float("nan")
-    room.panel.switch(browser.client_id, is_on=True)
+    room.panel.switch(browser.view, is_on=True)
     browser.camera.update(None)
     assert room.renderer.orders == []
     browser.camera.aspect = 1.0
@@ -201,13 +201,12 @@ def test_a_view_that_makes_no_sense_is_left_alone_until_it_does(room, browser):
 
 
 def test_who_left_gets_no_more_pictures(room, browser):
-    room.panel.switch(browser.client_id, is_on=True)
+    room.panel.switch(browser.view, is_on=True)
     until(lambda: room.renderer.orders)
-    room.panel.remove_client(browser)
+    room.panel.remove(browser.view)
     room.renderer.answer(0)
     other = Browser()
-    room.panel.add_client(other)
-    room.panel.switch(other.client_id, is_on=True)
+    room.panel.switch(room.panel.add(other, lambda: (room.state(), "")), is_on=True)
     room.renderer.answer(1)
     until(lambda: other.pictures)
     assert browser.pictures == []

@@ -50,15 +50,16 @@ def rollouts():
 
 
 def ghost(driver, name):
-    node = driver.node(f"/push/ghost/{name}")
-    return np.asarray(node.batched_positions)[0], np.asarray(node.batched_wxyzs)[0]
+    """Where the ghost is that goes along."""
+    node = driver.node(f"/push/future/{name}")
+    return np.asarray(node.batched_positions)[-1], np.asarray(node.batched_wxyzs)[-1]
 
 
 def test_what_moves_gets_a_ghost_at_the_end_and_a_way(drawing, driver, rollouts):
     drawing.show(rollouts)
     assert drawing.moving == (BOX, GONE)
     np.testing.assert_allclose(ghost(driver, BOX)[0], [0.12, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(driver.node("/push/pusher").position, [0.1, 0, 0.06], atol=1e-6)
+    np.testing.assert_allclose(driver.node("/push/future/pusher").position, [0.1, 0, 0.06], atol=1e-6)
     assert driver.shows("/push/ways")
     assert driver.node("/push/ways").points.shape == (2 * (COUNT - 1), 2, 3)
     assert driver.node("/push/ways").points[0, 0, 2] > 0.1  # above the box
@@ -66,9 +67,8 @@ def test_what_moves_gets_a_ghost_at_the_end_and_a_way(drawing, driver, rollouts)
 
 def test_the_trail_is_spread_over_the_way_and_not_over_the_wait(drawing, driver, rollouts):
     drawing.show(rollouts)
-    assert driver.below("/push/trail") == {BOX}  # what only turns has none
-    x = np.asarray(driver.node(f"/push/trail/{BOX}").batched_positions)[:, 0]
-    assert len(x) == TRAIL
+    x = np.asarray(driver.node(f"/push/future/{BOX}").batched_positions)[:TRAIL, 0]
+    assert len(np.unique(x)) == TRAIL
     assert x.min() > 0.01
     assert x.max() < 0.12
 
@@ -103,7 +103,7 @@ def test_truth_is_drawn_beside_it_and_all_goes_again(drawing, driver, rollouts):
     drawing.plan(np.array([[0, 0], [0.1, 0.1]]))
     drawing.clear()
     assert drawing.moving == ()
-    assert not driver.shows("/push/pusher")
+    assert not driver.shows("/push/future/pusher")
     assert not driver.shows("/push/ways")
     assert driver.shows("/push/plan")
     drawing.plan(None)
@@ -244,10 +244,11 @@ class Room:
 
     def moving(self):
         """Objects with a ghost."""
-        return self.gui.below("/push/ghost")
+        names = self.gui.below("/push/future") - {"pusher"}
+        return {name for name in names if self.gui.shows(f"/push/future/{name}")}
 
     def ghost_x(self):
-        return self.gui.node(f"/push/ghost/{BOX}").batched_positions[0, 0]
+        return self.gui.node(f"/push/future/{BOX}").batched_positions[-1, 0]
 
 
 @pytest.fixture
