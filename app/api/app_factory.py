@@ -34,7 +34,7 @@ from app.api import (
     scenes,
     status,
 )
-from app.api.bodies import SMALL_BODY_BYTES
+from app.api.bodies import SMALL_BODY_BYTES, CompressionMiddleware, HeadMiddleware
 from app.api.dependencies import Services, only_the_driver
 from app.api.guards.connection_timeouts import BodyTimeoutMiddleware
 from app.api.guards.security import BodyLimitMiddleware, SecurityMiddleware
@@ -54,7 +54,7 @@ _ROUTERS = (
     page.presets_router, page.stories_router, goals.router, photos.router, photos.calibration_router, episodes.router,
     estimates.router, predictions.router, jobs.router, events.router,
 )  # fmt: skip
-_OPEN_ROUTERS = (page.driver_router, page.views_router, robot.router)  # of one page alone, and a stop for anybody
+_OPEN_ROUTERS = (page.driver_router, page.views_router, robot.router, relay.router)  # of one page, or for anybody
 _OTHER_MODELS = (
     problems.Problem, events.ForgottenEvent, events.FrameEvent, events.LookEvent, events.NoticeEvent,
     estimates.EstimateIn, goals.GoalIn,
@@ -77,6 +77,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.settings, app.state.metrics = settings, status.Metrics()
     limit_of = partial(_body_limit, settings)
+    app.add_middleware(CompressionMiddleware)
+    app.add_middleware(HeadMiddleware)
     app.add_middleware(BodyTimeoutMiddleware)
     app.add_middleware(BodyLimitMiddleware, limit_of=limit_of)
     if settings.token is not None:
@@ -93,8 +95,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         app.include_router(router, dependencies=[Depends(only_the_driver)])
     for router in _OPEN_ROUTERS:
         app.include_router(router)
-    app.include_router(relay.router)
     _add_docs(app)
+    app.state.routes = [route for router in (*_ROUTERS, *_OPEN_ROUTERS, app) for route in router.routes]
     app.openapi = lambda: _openapi(app)  # pyright: ignore[reportAttributeAccessIssue]
     app.mount("/", StaticFiles(directory=static_folder(), html=True), name="static")
     return app

@@ -1,4 +1,4 @@
-"""Bodies of requests, within bounds, and bodies of answers: images and files."""
+"""Bodies of requests, within bounds, and bodies of answers: images, files, compressed ones and none."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import anyio
 from fastapi import HTTPException, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import ValidationError
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware.gzip import DEFAULT_EXCLUDED_CONTENT_TYPES, GZipMiddleware
 from starlette.responses import FileResponse
-from starlette.types import Receive, Scope, Send
+from starlette.staticfiles import NotModifiedResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api.models import Input
 from app.api.problems import NotFound, too_large
@@ -106,6 +110,50 @@ def parsed(model: type[Model], body: bytes) -> Model:
         raise RequestValidationError(entries) from None
 
 
+class HeadMiddleware:
+    """Answers HEAD as GET is answered, without the body."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on one request."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+        with anyio.CancelScope() as answering:
+
+            async def send_head(message: Message) -> None:
+                if message["type"] == "http.response.body":
+                    await send({"type": "http.response.body"})
+                    answering.cancel()  # a stream would go on for ever
+                else:
+                    await send(message)
+
+            await self._app({**scope, "method": "GET"}, receive, send_head)
+
+
+class CompressionMiddleware(GZipMiddleware):
+    """Compresses answers, but for parts of files, streams, and media types that are compressed already."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        packed = ("application/octet-stream", "application/pdf")
+        super().__init__(app, compresslevel=5, exclude_content_types=(*DEFAULT_EXCLUDED_CONTENT_TYPES, *packed))
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on one request."""
+
+        async def send_marked(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                tag = headers.get("etag", "")
+                if tag.startswith('"') and headers.get("content-encoding") == "gzip":
+                    headers["ETag"] = f"W/{tag}"  # other bytes than of the file of which a part may be asked for
+            await send(message)
+
+        await super().__call__(scope, receive, send_marked)
+
+
 BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 
@@ -171,8 +219,12 @@ class OpenFile(FileResponse):
         )
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the file and close it, also if whoever asked has gone."""
+        """Send the file, or that it is the one that is known; close it, also if whoever asked has gone."""
         try:
-            await super().__call__(scope, receive, send)
+            known = Headers(scope=scope).get("if-none-match", "")
+            if self.headers["etag"] in [tag.strip().removeprefix("W/") for tag in known.split(",")]:
+                await NotModifiedResponse(self.headers)(scope, receive, send)
+            else:
+                await super().__call__(scope, receive, send)
         finally:
             self._file.close()

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from app.api.bodies import FORGOTTEN, PNG, BoundedRoute, Forget, OpenFile, binary
 from app.api.dependencies import Services, ServicesDep, slow, urgent
-from app.api.events import StreamDep, followed
+from app.api.events import SEEN, LastEventId, StreamDep, followed, unended
 from app.api.jobs import JobOut, ProgressOut, progress_of
 from app.api.models import (
     HORIZON,
@@ -361,8 +361,14 @@ def change(services: ServicesDep, job: FoundDep, body: SettingsIn) -> EpisodeOut
     return _out(services, services.episodes.change(job, body.given()))
 
 
-@router.get("/{episode}/events", response_class=EventSourceResponse, responses=problems(404, 503))
-async def follow(services: ServicesDep, job: FoundDep, counted: StreamDep) -> AsyncIterator[ServerSentEvent]:
+async def _unended(job: FoundDep, last_event_id: LastEventId = None) -> Job:
+    return unended(job, last_event_id)
+
+
+@router.get("/{episode}/events", response_class=EventSourceResponse, responses={**problems(404, 503), **SEEN})
+async def follow(
+    services: ServicesDep, job: Annotated[Job, Depends(_unended)], counted: StreamDep
+) -> AsyncIterator[ServerSentEvent]:
     """Follow one episode: "job" events as at /api/events, from how it is now to its end."""
     del counted
     async for event in followed(services, job):

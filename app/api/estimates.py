@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 
 from app.api.bodies import BINARY, FORGOTTEN, JSON, SMALL_BODY_BYTES, Forget, OpenFile, kind_of, parsed, whole_body
 from app.api.dependencies import ServicesDep, urgent
-from app.api.events import StreamDep, followed
+from app.api.events import SEEN, LastEventId, StreamDep, followed, unended
 from app.api.jobs import ProgressOut, progress_of
 from app.api.models import FileName, Identifier, Input, Seed
 from app.api.paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
@@ -150,6 +150,7 @@ _BODY = {
     }
 }
 router = APIRouter(prefix=UPLOAD_PATH, tags=["estimates"], responses=problems())
+_UPLOAD_DEFAULTS = {"mode": "first", "seed": "0", "file_name": "observation.zip", "method": "ours"}
 View = Annotated[int, Path(ge=0, le=1000, description="Number of the camera, from 0.")]
 
 
@@ -226,8 +227,14 @@ def cancel(services: ServicesDep, job: FoundDep, forget: Forget = False) -> Esti
     return _out(services.estimates, services.runner.jobs.cancel(job.id))
 
 
-@router.get("/{estimate}/events", response_class=EventSourceResponse, responses=problems(404, 503))
-async def follow(services: ServicesDep, job: FoundDep, counted: StreamDep) -> AsyncIterator[ServerSentEvent]:
+async def _unended(job: FoundDep, last_event_id: LastEventId = None) -> Job:
+    return unended(job, last_event_id)
+
+
+@router.get("/{estimate}/events", response_class=EventSourceResponse, responses={**problems(404, 503), **SEEN})
+async def follow(
+    services: ServicesDep, job: Annotated[Job, Depends(_unended)], counted: StreamDep
+) -> AsyncIterator[ServerSentEvent]:
     """Follow one estimate: "job" events as at /api/events, from how it is now to its end."""
     del counted
     async for event in followed(services, job):
@@ -265,13 +272,17 @@ def _out(estimates: Estimates, job: Job) -> EstimateOut:
 
 
 async def _body(request: Request, kind: str) -> EstimateIn:
-    """The JSON of a request; nothing at all asks for the defaults."""
+    """The JSON of a request; nothing at all asks for the defaults.
+
+    The query is for uploads, but generated clients send its defaults along.
+    """
     body = await whole_body(request, SMALL_BODY_BYTES)
     if not body and not kind:
         return EstimateIn.model_validate({})
     if kind != JSON:
         allowed = f"{JSON} for a scene, or {_ZIP} for an observation folder"
         raise HTTPException(415, f"The body is {kind or 'untyped'}, but it must be {allowed}.")
-    if request.query_params:
-        raise OsfError(f"{next(iter(request.query_params))} stands in the query, which is for uploads; use the body.")
+    for name, value in request.query_params.items():
+        if value != _UPLOAD_DEFAULTS.get(name):
+            raise OsfError(f"{name} stands in the query, which is for uploads; use the body.")
     return parsed(EstimateIn, body)

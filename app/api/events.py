@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator
 from functools import partial
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Header, Query
+from fastapi import APIRouter, Depends, Header, HTTPException, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
@@ -93,6 +93,9 @@ LOOK_INTERVAL_S = 0.3
 _MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest are dropped
 _LOOK_INTERVAL_S = 0.5
 _MAX_EVENT = 2**63 - 1
+_END = "end"  # the identifier of the last event of a job's own stream
+LastEventId = Annotated[str | None, Header(description="Identifier of the last event that was seen.")]
+SEEN: dict[int | str, dict[str, Any]] = {204: {"description": "The end of it was seen already."}}
 Letter = JobChanged | JobForgotten | Notice | GoalsChanged | PhotosChanged | DriverChanged
 
 
@@ -251,14 +254,30 @@ async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEven
         with contextlib.suppress(UnknownName):  # one that was just removed for good ends as it was
             job = services.runner.jobs.get(job.id)  # again, now that nothing is missed
         now = job
-        yield job_event(services, 0, now)
+        yield _event_of(services, now)
         while not now.is_finished and not services.closing.is_set():
             letter = await mailbox.next_job(job.id)
             if letter is not None:
                 now = letter.job
-                yield job_event(services, letter.event, now)
+                yield _event_of(services, now)
     finally:
         leave()
+
+
+def _event_of(services: Services, job: Job) -> ServerSentEvent:
+    text = services.event_texts.of(job, partial(JobOut.of, job))
+    return ServerSentEvent(event="job", id=_END if job.is_finished else None, raw_data=text)
+
+
+def unended(job: Job, last_event_id: str | None) -> Job:
+    """The job that a stream is about.
+
+    Raises:
+        HTTPException: 204 if the client has seen its end, which keeps EventSource from connecting again.
+    """
+    if job.is_finished and last_event_id == _END:
+        raise HTTPException(204)
+    return job
 
 
 def job_event(services: Services, number: int, job: Job) -> ServerSentEvent:

@@ -7,12 +7,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Route
 
 from app.storage.paths import without_places
 from osfcore.errors import OsfError, UnknownName
@@ -180,14 +181,25 @@ async def _on_osf_error(request: Request, error: Exception) -> ProblemResponse:
     return problem(status, detail, headers={"Retry-After": "2"} if status in (429, 503) else None)
 
 
-async def _on_http_error(request: Request, error: Exception) -> ProblemResponse:
+async def _on_http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
-    detail = str(error.detail)
+    if error.status_code == 204:
+        return Response(status_code=204)
+    detail, headers = str(error.detail), dict(error.headers or {})
     if error.status_code == 404 and detail == "Not Found":
         detail = f"There is nothing at {request.url.path}."
     if error.status_code == 405:
         detail = f"{request.url.path} does not offer {request.method}."
-    return problem(error.status_code, detail, headers=dict(error.headers or {}))
+        headers["Allow"] = ", ".join(_methods(request))
+    return problem(error.status_code, detail, headers=headers)
+
+
+def _methods(request: Request) -> list[str]:
+    """What a path offers, over all its routes; files of the page, which have none, can be read."""
+    path = request.scope["path"].removeprefix(request.scope.get("root_path", ""))
+    routes = [route for route in request.app.state.routes if isinstance(route, Route) and route.path_regex.match(path)]
+    methods = {method for route in routes for method in route.methods or ()} or {"GET"}
+    return sorted(methods | ({"HEAD"} if "GET" in methods else set()))
 
 
 async def _on_validation_error(_: Request, error: Exception) -> ProblemResponse:

@@ -166,6 +166,16 @@ def test_ranges_of_the_same_version_continue_a_download(client, path):
     assert (again.status_code, again.content) == (200, b"another version")
 
 
+def test_a_file_that_is_known_is_not_sent_again_until_it_changes(client, path):
+    tag = client.get("/file").headers["etag"]
+    for known in (tag, f"W/{tag}", f'"another", {tag}'):
+        again = client.get("/file", headers={"If-None-Match": known})
+        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
+    write_atomically(path, b"another version")
+    assert client.get("/file", headers={"If-None-Match": tag}).content == b"another version"
+    assert descriptors(path) == 0
+
+
 @pytest.mark.parametrize("change", [lambda path: path.unlink(), lambda path: (path.unlink(), path.mkdir())])
 def test_a_file_that_is_gone_is_not_found(client, path, change):
     change(path)

@@ -217,6 +217,17 @@ def test_its_events_end_with_it(live):
     live.request("DELETE", f"/api/scenes/{scene['id']}")
 
 
+def test_whoever_has_seen_its_end_is_not_asked_to_connect_again(service, scene, busy):
+    path = f"/api/episodes/{service.post('/api/episodes', json={'poses': poses_of(scene)}).json()['id']}"
+    service.delete(path)
+    ended = service.get(f"{path}/events")
+    assert "id: end" in ended.text.splitlines()
+    assert '"state":"cancelled"' in ended.text
+    assert service.get(f"{path}/events", headers={"Last-Event-ID": "7"}).text == ended.text
+    again = service.get(f"{path}/events", headers={"Last-Event-ID": "end"})
+    assert (again.status_code, again.content) == (204, b"")
+
+
 def test_the_method_as_published_is_a_setting(service, scene, busy):
     body = {"poses": poses_of(scene), "settings": {"method": "paper", "steps": 2}}
     episode = service.post("/api/episodes", json=body)

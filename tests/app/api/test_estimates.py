@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from app.cli.collect import CollectObservationCommand
 from PIL import Image
 from pydantic import ValidationError
 
+from app.api.app_factory import create_app
 from app.api.estimates import EstimateIn, EstimateOut
+from app.cli.collect import CollectObservationCommand
 from app.jobs.job import Job
 from app.services.estimates import Asked
 from osfcore.geometry.cameras import default_cameras
@@ -196,6 +197,15 @@ def test_images_of_different_sizes_are_refused(service, folder, tmp_path):
 )
 def test_mistakes_are_told(service, scene, request_, status, words):
     assert words in str(is_problem(service.post("/api/estimates", **request_), status))
+
+
+def test_clients_may_send_the_defaults_of_the_query_with_json(service, scene):
+    operation = create_app().openapi()["paths"]["/api/estimates"]["post"]
+    declared = {one["name"]: one["schema"].get("default") for one in operation["parameters"]}
+    assert declared["file_name"] == "observation.zip"
+    params = {name: value for name, value in declared.items() if value is not None}
+    answer = service.post("/api/estimates", json={"scene": "nowhere"}, params=params)
+    assert "no such scene" in is_problem(answer, 422)["detail"]
 
 
 @pytest.mark.parametrize(
