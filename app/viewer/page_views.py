@@ -206,6 +206,8 @@ class PageViews(Panel):
             for _, page, _ in due:
                 page.is_due = False
         for name, page, view in due:
+            if page.view is not view:
+                continue  # it has left in between
             try:
                 with atomic(view.client):  # live table and replay are never seen together
                     self._draw_view(page, view)

@@ -37,6 +37,7 @@ class PushNodes:
         self._library = library
         self._lock = threading.RLock()
         self._step = 0.0
+        self._vertices: dict[str, np.ndarray] = {}  # of what is on view; objects may be removed, and come back
         self._future = FutureNodes(server.scene, library, "/push/future", _STYLE)
         add = server.scene.add_line_segments
         self._plan = add("/push/plan", NO_LINES, PREDICTED, thickness=0.006, visible=False)
@@ -57,7 +58,7 @@ class PushNodes:
     def show(self, rollouts: Rollouts) -> None:
         """Show the first of some rollouts in place of the one before, at its end."""
         with self._lock, atomic(self._server):
-            self._true_ways.visible = False
+            self._true_ways.visible, self._vertices = False, {}
             self._future.show(rollouts)
             self._step = len(rollouts.pusher[0]) - 1.0
             self._future.at(self._step)
@@ -91,8 +92,9 @@ class PushNodes:
         lines = []
         for name, poses in ways.items():
             if moves(poses):
-                vertices, _ = mesh_of(self._library, name, FINE_CELLS)
-                height_m = top_m(vertices, poses.quaternion[0]) + _ABOVE_M
+                if name not in self._vertices:
+                    self._vertices[name], _ = mesh_of(self._library, name, FINE_CELLS)
+                height_m = top_m(self._vertices[name], poses.quaternion[0]) + _ABOVE_M
                 lines.append(poses.position + np.array([0.0, 0.0, height_m]))
         _draw(node, lines)
 
