@@ -48,7 +48,8 @@ class StandIn:
         self.pusher = np.array([0.0, 0.0, PUSHER_CENTRE_Z_M])
         self.pictures = dict.fromkeys(cameras, jpeg(np.full((SIDE, SIDE, 3), 100, np.uint8)))
         self.twists, self.frames, self.silent = [], [], set()
-        self.last_twist = 0.0
+        self._commands, self._coming = [(time.monotonic(), np.zeros(2))], threading.Lock()
+        self._moved_until = time.monotonic()
         self.extra, self.noise = {}, []
         self._ends = threading.Event()
         self._sockets = []
@@ -89,10 +90,12 @@ class StandIn:
 
     def _take(self, message):
         linear = message["twist"]["linear"]
-        self.velocity = np.array([linear["x"], linear["y"]])
-        self.twists.append(self.velocity)
+        velocity = np.array([linear["x"], linear["y"]])
+        with self._coming:
+            self._commands.append((time.monotonic(), velocity))
+            self.velocity = velocity
+        self.twists.append(velocity)
         self.frames.append(message["header"]["frame_id"])
-        self.last_twist = time.monotonic()
 
     def _speak(self, connection, asked):
         once = set()
@@ -108,18 +111,25 @@ class StandIn:
                 self._ends.wait(EVERY_S)
 
     def control(self):
-        """Move the pusher in real time as the last twist says, until the end."""
-        before = time.monotonic()
+        """Move the pusher as twists say, until the end."""
         while not self._ends.wait(0.005):
-            now = time.monotonic()
-            self._halt_without_twists()
-            if self.velocity.any():  # a test may put it elsewhere meanwhile
-                self.pusher = self.pusher + (now - before) * np.array([*self.velocity, 0.0])
-            before = now
+            for velocity, seconds in self._motions():
+                self.pusher = self.pusher + seconds * np.array([*velocity, 0.0])
 
-    def _halt_without_twists(self):
-        if time.monotonic() - self.last_twist > DEADMAN_S:
-            self.velocity = np.zeros(2)
+    def _motions(self):
+        """What twists have asked for since the last call, by when they came: no delay of this thread changes it."""
+        motions = []
+        with self._coming:
+            now = time.monotonic()
+            ends = [at for at, _ in self._commands[1:]] + [now]
+            for (begin, velocity), end in zip(self._commands, ends, strict=True):
+                seconds = min(end, begin + DEADMAN_S) - max(begin, self._moved_until)
+                if velocity.any() and seconds > 0:  # else a test may have put the pusher elsewhere
+                    motions.append((velocity, seconds))
+            self._commands, self._moved_until = self._commands[-1:], now
+            if now - self._commands[0][0] > DEADMAN_S:
+                self.velocity = np.zeros(2)
+        return motions
 
     @contextlib.contextmanager
     def running(self):
@@ -153,10 +163,11 @@ class TableStandIn(StandIn):
 
     def control(self):
         while not self._ends.wait(_MOVES_S):
-            self._halt_without_twists()
-            if self.velocity.any():
+            motions = self._motions()
+            if motions:
                 with self._using:
-                    self.table.act(np.array([*self.velocity, 0.0]) * _MOVES_S / STEP_S)
+                    for velocity, seconds in motions:
+                        self.table.act(np.array([*velocity, 0.0]) * seconds / STEP_S)
                     self._look()
 
     def _look(self):

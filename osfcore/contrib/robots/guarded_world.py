@@ -20,11 +20,11 @@ from osfcore.geometry.workspace import STEP_S, check_action
 from osfcore.io.image_file import to_uint8
 from osfcore.photo.segmentation import Box, propose_masks
 
-_OVERSHOT_M = 0.01  # a pusher may have come so far outside the box by itself, and returns
+_OUTSIDE_M = 0.01  # a pusher may have come so far outside the box by itself, and returns
 
 # How far what a robot says of its pusher may differ from what was asked of it.
 _PLACE_ERROR_M = 0.01  # of a measured place: calibration, and the give of an arm that pushes
-_LAG_S = 0.1  # for which a controller may go on after a motion
+_OVERSHOT_SHARE = 0.5  # of a motion: a controller may go on for 0.1 s after each 0.2 s
 _FELT_M = 0.005  # shorter motions say nothing of whether it moves: a measured place trembles
 _LEAST_SHARE = 1 / 3  # of a motion that is done: a controller that needs 0.1 s to speed up does half of each 0.2 s
 _HELD_M = 0.1  # of motions in a row of which less was done: an object may hold the pusher for one, but not for ever
@@ -66,7 +66,7 @@ class GuardedWorld:
         self._where: Whereabouts | None = None
         self._seen_at = np.zeros(2)  # where the robot said last that the pusher is [m]
         self._asked = self._wished = np.zeros(2)  # travel since, and what it would be were that place certain [m]
-        self._fastest_m_s = 0.0  # since then
+        self._way_m = 0.0  # length of all travels since
         self._unmoved_m = 0.0  # travel asked for since the pusher was last seen to move
         self._reason = ""
         self._stopped = threading.Event()
@@ -102,10 +102,13 @@ class GuardedWorld:
     # The World protocol
 
     def reset(self, seed: int) -> Observation:
-        """Reset the wrapped world, whose pusher may be anywhere then."""
+        """Reset the wrapped world; a robot only observes, so its pusher is compared as in `observe`."""
         with self._halted_by_errors():
             seen = self._world.reset(seed)
-        self._locate(seen.pusher)
+        if isinstance(self._world, Stoppable):
+            self._take_place(seen.pusher)
+        else:
+            self._locate(seen.pusher)
         return seen
 
     def observe(self, *, masks: bool = False) -> Observation:
@@ -116,10 +119,7 @@ class GuardedWorld:
         """
         with self._halted_by_errors():
             seen = self._world.observe(masks=masks)
-        if seen.pusher is None or self._where is None or not self._is_started or self._stopped.is_set():
-            self._locate(seen.pusher)
-        else:
-            self._compare(seen.pusher, self._where)
+        self._take_place(seen.pusher)
         return seen
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
@@ -134,19 +134,18 @@ class GuardedWorld:
         self.check()
         where = self._where
         if where is None:
-            raise InvalidInput("place of the pusher", "unknown", "told by the robot before it is moved")
-        if self._limits.outside_m(where) > _OVERSHOT_M:
+            raise InvalidInput("place of the pusher", "unknown", "said by the robot before it is moved")
+        if self._limits.outside_m(where) > _OUTSIDE_M:
             allowed = f"within {self._limits.box}, the safety box; move it there by hand, or allow a larger box"
             raise InvalidInput("place of the pusher [m]", np.round(where.low, 3).tolist(), allowed)
         travel = self._limits.allowed_travel(wanted, where)
         if not np.allclose(travel, wanted, atol=1e-6):
             self._held_back.append(HeldBack(action, np.array([*(travel / STEP_S), 0.0])))
         self._begin()
-        parts = self._limits.slow_parts(travel)
         self._where, self._asked = where.after(travel), self._asked + travel
+        self._way_m += float(np.linalg.norm(travel))
         self._wished = self._wished + self._limits.allowed_travel(wanted, Whereabouts.at(self._seen_at))
-        self._fastest_m_s = max(self._fastest_m_s, float(np.linalg.norm(parts[0])))
-        for velocity in parts:
+        for velocity in self._limits.slow_parts(travel):
             self.check()
             with self._halted_by_errors():
                 self._world.act(velocity)
@@ -158,6 +157,13 @@ class GuardedWorld:
             self.stop("it was let go")
         self._world.close()
 
+    def _take_place(self, pusher: Float[np.ndarray, "3"] | None) -> None:
+        """Compare the place that the robot says if the robot may have been moved since the one before."""
+        if pusher is None or self._where is None or not self._is_started or self._stopped.is_set():
+            self._locate(pusher)
+        else:
+            self._compare(pusher, self._where)
+
     def _locate(self, pusher: Float[np.ndarray, "3"] | None) -> None:
         """Take the pusher to be where the robot says."""
         self._where, self._unmoved_m = None if pusher is None else Whereabouts.at(pusher), 0.0
@@ -165,7 +171,7 @@ class GuardedWorld:
             self._compare_from(pusher)
 
     def _compare_from(self, pusher: Float[np.ndarray, "3"]) -> None:
-        self._seen_at, self._fastest_m_s = pusher[:2].astype(float), 0.0
+        self._seen_at, self._way_m = pusher[:2].astype(float), 0.0
         self._asked = self._wished = np.zeros(2)
 
     def _compare(self, pusher: Float[np.ndarray, "3"], where: Whereabouts) -> None:
@@ -175,7 +181,7 @@ class GuardedWorld:
             RobotStopped: if they do.
         """
         off_m = where.distance_m(pusher[:2])
-        if off_m > _PLACE_ERROR_M + _LAG_S * self._fastest_m_s:
+        if off_m > _PLACE_ERROR_M + _OVERSHOT_SHARE * self._way_m:
             off = f"its pusher is {1000 * off_m:.0f} mm away from where it was asked to go"
             self.stop(f"{off}; see whether something moved it, and whether places and velocities have the same axes")
             self.check()

@@ -137,6 +137,16 @@ def test_a_pusher_that_always_says_the_same_place_is_stopped_before_it_is_asked_
         assert BOX[0] - 1e-9 <= world.place[0] < -0.05
 
 
+def test_a_reset_of_a_robot_proves_no_place():
+    world = Marble(blind=True)
+    guard = guarded(world)
+    guard.act(RIGHT)
+    guard.reset(0)
+    guard.act(RIGHT)
+    with pytest.raises(RobotStopped, check=about("hardly moved")):
+        guard.reset(0)
+
+
 def test_a_pusher_that_goes_back_and_forth_without_moving_is_stopped():
     guard = guarded(Marble(shares=[0.0] * 100))
     with pytest.raises(RobotStopped, check=about("hardly moved")):
@@ -171,10 +181,10 @@ def test_a_pusher_that_an_object_holds_once_goes_on_and_may_be_anywhere_between_
     np.testing.assert_allclose(one.done, [0.05, 0.0, 0.0], atol=1e-12)
 
 
-def test_a_controller_that_lags_and_one_that_overshoots_a_little_are_not_stopped():
-    for share in (0.5, 1.15):
+def test_a_controller_that_lags_and_one_that_goes_on_a_little_are_not_stopped():
+    for share in (0.5, 1.4):
         world = Marble(shares=[share] * 400)
-        guard = guarded(world)
+        guard = guarded(world, SafetyLimits())
         move_and_look(guard, *[RIGHT, RIGHT, -RIGHT, -RIGHT] * 10)
         assert world.told == ["start"]
 

@@ -184,6 +184,18 @@ def test_whatever_a_robot_answers_is_a_refusal(odd, odd_robot, answer):
         guard.check()
 
 
+def test_a_robot_whose_place_never_changes_is_stopped(odd, odd_robot):
+    odd[1].spoilt = dict.fromkeys(("/start", "/act", "/stop"), Response(status_code=204))
+    odd[1].picture = encode_png(np.zeros((64, 64, 3), np.uint8))
+    guard = GuardedWorld(odd_robot, FAST)
+    guard.observe()
+    guard.act(LEFT)
+    guard.observe()
+    guard.act(LEFT)
+    with pytest.raises(RobotStopped, check=about("hardly moved")):
+        guard.observe()
+
+
 def test_pictures_that_are_too_large_are_refused_before_they_are_decoded(odd, odd_robot):
     odd[1].picture = b"0" * 33_000_000
     with pytest.raises(RobotRefused, check=about("32 MB")):

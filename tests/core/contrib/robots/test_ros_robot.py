@@ -80,7 +80,7 @@ def test_velocities_are_sent_in_the_frame_of_the_table_once_it_is_started_until_
     assert set(stand_in.frames) == {"table"}
     assert len(stand_in.twists) >= 3
     np.testing.assert_allclose(stand_in.twists[0], LEFT[:2], atol=1e-12)
-    assert stand_in.pusher[0] < -0.02
+    until(lambda: stand_in.pusher[0] < -0.02)
 
 
 def test_nothing_follows_the_zero_of_a_stop_from_another_thread(robot, stand_in):
@@ -96,6 +96,18 @@ def test_nothing_follows_the_zero_of_a_stop_from_another_thread(robot, stand_in)
         guard.act(LEFT)
     moving = [bool(twist.any()) for twist in stand_in.twists]
     assert moving == sorted(moving, reverse=True)
+
+
+def test_a_robot_whose_place_never_changes_is_stopped(robot, stand_in):
+    stand_in.extra["/tf"] = stand_in.messages()["/tf"]
+    guard = GuardedWorld(robot, FAST)
+    guard.observe()
+    guard.act(LEFT)
+    guard.observe()
+    guard.act(LEFT)
+    with pytest.raises(RobotStopped, check=about("hardly moved")):
+        guard.observe()
+    until(lambda: not stand_in.twists[-1].any())
 
 
 def test_a_robot_that_is_cut_off_stands(robot, stand_in):
