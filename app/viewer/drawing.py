@@ -14,7 +14,6 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from html import escape
 
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged, SceneRecord
@@ -151,14 +150,7 @@ def status(about: str, text: str) -> str:
 # The playback
 
 _CATCH_UP_S = 0.5  # further behind than this, playing goes faster than time
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Item:
-    """Something to draw; what is of an older generation was overtaken by a jump."""
-
-    event: CurrentScene | SceneChanged | FramesTaken
-    generation: int
+_Change = CurrentScene | SceneChanged | FramesTaken
 
 
 class Playback:
@@ -173,9 +165,9 @@ class Playback:
 
     def __init__(self, drawing: SceneNodes) -> None:
         self._drawing = drawing
-        self._queue: queue.Queue[_Item | None] = queue.Queue()
+        self._queue: queue.Queue[tuple[_Change, int] | None] = queue.Queue()  # with the generation of each
         self._lock = threading.Lock()
-        self._generation = 0
+        self._generation = 0  # what is of an older one was overtaken by a jump
         self._waiting_s = 0.0
         self._noted: str | None = None  # the scene that will be shown once everything in line is drawn
         self._shown: str | None = None
@@ -210,36 +202,37 @@ class Playback:
                         return
                 case _:
                     return
-            self._queue.put(_Item(event, self._generation))
+            self._queue.put((event, self._generation))
 
     def _play(self) -> None:
         while (item := self._queue.get()) is not None:
+            event, generation = item
             try:
-                self._draw(item)
+                self._draw(event, generation)
             except Exception:  # one event that cannot be drawn must not end the view
-                _log.exception("the viewer could not draw %s", type(item.event).__name__)
+                _log.exception("the viewer could not draw %s", type(event).__name__)
 
-    def _draw(self, item: _Item) -> None:
-        match item.event:
+    def _draw(self, event: _Change, generation: int) -> None:
+        match event:
             case CurrentScene(record):
                 self._shown = None if record is None else record.id
                 self._drawing.show(None if record is None else record.state)
             case SceneChanged(record, states, interval_s):
                 try:
-                    self._play_states(item, states, interval_s)
+                    self._play_states(states, interval_s, generation)
                 finally:
                     with self._lock:
                         self._waiting_s -= interval_s * len(states)
-                if item.generation == self._generation and record.id == self._shown:
+                if generation == self._generation and record.id == self._shown:
                     self._drawing.place(record.state)
             case FramesTaken(_, _, names, images):
-                if item.generation == self._generation:
+                if generation == self._generation:
                     self._drawing.show_frames(names, images)
 
-    def _play_states(self, item: _Item, states: tuple[SceneState, ...], interval_s: float) -> None:
+    def _play_states(self, states: tuple[SceneState, ...], interval_s: float, generation: int) -> None:
         due = time.monotonic()
         for state in states:
-            if item.generation != self._generation:
+            if generation != self._generation:
                 return
             self._drawing.place(state)
             due += interval_s / max(1.0, self._waiting_s / _CATCH_UP_S)

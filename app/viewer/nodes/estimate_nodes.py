@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import viser
+from jaxtyping import Float
 
 from app.viewer.nodes.ghosts import (
     Mesh,
@@ -41,7 +43,39 @@ _TABLE_M = 0.0015  # above it, so that it does not flicker
 _LABEL_M = 0.045
 _WIRES, _FAINT_WIRES = 0.9, 0.35  # opacity; things on their way are to be seen through them
 _WIRE_SCALE = 1.01  # or wires and the surface below them would flicker
-Copies = viser.BatchedMeshHandle
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _ObjectNodes:
+    """What is drawn of one object.
+
+    Attributes:
+        vertices: of its mesh [m].
+        tried: candidates.
+        guess: the best pose so far.
+        tracked: the pose of an object on its way.
+    """
+
+    vertices: Float[np.ndarray, "P 3"]
+    tried: viser.BatchedMeshHandle
+    guess: viser.BatchedMeshHandle
+    tracked: viser.BatchedMeshHandle
+
+    def place(self, pose: Pose, *, is_tracked: bool) -> None:
+        """Show where the object is; what was not looked for yet is hidden."""
+        shown, hidden = (self.tracked, self.guess) if is_tracked else (self.guess, self.tracked)
+        hidden.visible = False
+        move_ghosts(shown, Pose(pose.position[None], pose.quaternion[None]))
+        shown.visible = bool(pose.position[2] > UNPLACED_BELOW_M)
+
+    def paint(self, colour: Colour) -> None:
+        """Give the pose a colour."""
+        self.guess.batched_colors = self.tracked.batched_colors = np.array(colour, np.uint8)
+
+    def remove(self) -> None:
+        """Remove all."""
+        for node in (self.tried, self.guess, self.tracked):
+            node.remove()
 
 
 class EstimateNodes:
@@ -72,11 +106,7 @@ class EstimateNodes:
         self._scene = server.scene
         self._library = library
         self._lock = threading.RLock()
-        self._names: tuple[str, ...] = ()
-        self._meshes: dict[str, Mesh] = {}
-        self._tried: dict[str, Copies] = {}
-        self._guesses: dict[str, Copies] = {}
-        self._tracked: dict[str, Copies] = {}
+        self._objects: dict[str, _ObjectNodes] = {}
         self._verdicts: list[viser.SceneNodeHandle] = []
         self._has_candidates = True
         self._lamp: LightMarker | None = None
@@ -85,7 +115,7 @@ class EstimateNodes:
     @property
     def is_empty(self) -> bool:
         """Whether nothing is drawn."""
-        return not self._names and self._lamp is None
+        return not self._objects and self._lamp is None
 
     def show(
         self,
@@ -103,10 +133,11 @@ class EstimateNodes:
             estimate: the result.
         """
         with self._lock, atomic(self._server):
-            self._begin(state.names)
-            for n, name in enumerate(state.names):
-                self._show_guess(name, state.poses[n], self._guesses, self._tracked)
-                self._show_tried(name, None if candidates is None else candidates[:, n])
+            for n, nodes in enumerate(self._begun(state.names)):
+                nodes.place(state.poses[n], is_tracked=False)
+                if candidates is not None:
+                    move_ghosts(nodes.tried, spread(candidates[:, n], GHOSTS))
+                nodes.tried.visible = candidates is not None and self._has_candidates
             self._show_light(state.light, lights, "guessed light")
             if estimate is not None:
                 self._judge(estimate)
@@ -119,68 +150,61 @@ class EstimateNodes:
             doubts: why each object is doubted, or "".
         """
         with self._lock, atomic(self._server):
-            self._begin(state.names)
-            for n, name in enumerate(state.names):
-                self._show_guess(name, state.poses[n], self._tracked, self._guesses)
-                self._show_tried(name, None)
-                self._mark(name, doubts[n])
+            for n, nodes in enumerate(self._begun(state.names)):
+                nodes.place(state.poses[n], is_tracked=True)
+                nodes.tried.visible = False
+                nodes.paint(_DOUBTED if doubts[n] else _SURE)
             self._show_light(state.light, None, "estimated light")
 
     def show_candidates(self, is_on: bool) -> None:
         """Show or hide what is tried."""
         with self._lock:
             self._has_candidates = is_on
-            for node in (*self._tried.values(), self._tried_lights):
+            for node in (*(nodes.tried for nodes in self._objects.values()), self._tried_lights):
                 node.visible = is_on and node.visible
 
     def clear(self) -> None:
         """Remove everything."""
         with self._lock, atomic(self._server):
-            self._begin(())
+            self._begun(())
             if self._lamp is not None:
                 self._lamp.remove()
             self._lamp, self._tried_lights.visible = None, False
 
-    def _begin(self, names: tuple[str, ...]) -> None:
-        """Make nodes for other objects than before, and remove the last verdict."""
+    def _begun(self, names: tuple[str, ...]) -> Iterable[_ObjectNodes]:
+        """Remove the last verdict, and make nodes if these are other objects than before."""
         for node in self._verdicts:
             node.remove()
         self._verdicts = []
-        for guess in (*self._guesses.values(), *self._tracked.values()):
-            guess.batched_colors = np.array(self._colour, np.uint8)
-        if names == self._names:
-            return
-        for node in (*self._tried.values(), *self._guesses.values(), *self._tracked.values()):
-            node.remove()
-        self._names = names
-        self._meshes = {name: mesh_of(self._library, name) for name in names}
-        self._tried = {name: self._add_tried(f"tried/{name}", mesh) for name, mesh in self._meshes.items()}
-        self._guesses = {name: self._add_wires(f"guess/{name}", mesh, _WIRES) for name, mesh in self._meshes.items()}
-        self._tracked = {
-            name: self._add_wires(f"{TRACKED}/{name}", mesh, _FAINT_WIRES) for name, mesh in self._meshes.items()
-        }
+        if names != tuple(self._objects):
+            for nodes in self._objects.values():
+                nodes.remove()
+            self._objects = {name: self._add_object(name) for name in names}
+        for nodes in self._objects.values():
+            nodes.paint(self._colour)
+        return self._objects.values()
 
-    def _add_tried(self, path: str, mesh: Mesh, colour: Colour = _TRIED, opacity: float = 0.2) -> Copies:
+    def _add_object(self, name: str) -> _ObjectNodes:
+        mesh = mesh_of(self._library, name)
+        guess, tracked = (
+            add_ghosts(
+                self._scene,
+                f"{self._root}/{part}/{name}",
+                mesh,
+                below_table(1),
+                self._colour,
+                opacity,
+                scale=_WIRE_SCALE,
+                is_wire=True,
+                visible=False,
+            )
+            for part, opacity in (("guess", _WIRES), (TRACKED, _FAINT_WIRES))
+        )
+        return _ObjectNodes(mesh[0], self._add_tried(f"tried/{name}", mesh, _TRIED, 0.2), guess, tracked)
+
+    def _add_tried(self, path: str, mesh: Mesh, colour: Colour, opacity: float) -> viser.BatchedMeshHandle:
         path = f"{self._root}/{path}"
         return add_ghosts(self._scene, path, mesh, below_table(GHOSTS), colour, opacity, visible=False)
-
-    def _add_wires(self, path: str, mesh: Mesh, opacity: float) -> Copies:
-        path, place = f"{self._root}/{path}", below_table(1)
-        return add_ghosts(
-            self._scene, path, mesh, place, self._colour, opacity, scale=_WIRE_SCALE, is_wire=True, visible=False
-        )
-
-    @staticmethod
-    def _show_guess(name: str, pose: Pose, shown: Mapping[str, Copies], hidden: Mapping[str, Copies]) -> None:
-        hidden[name].visible = False
-        move_ghosts(shown[name], Pose(pose.position[None], pose.quaternion[None]))
-        shown[name].visible = bool(pose.position[2] > UNPLACED_BELOW_M)
-
-    def _show_tried(self, name: str, candidates: Pose | None) -> None:
-        node = self._tried[name]
-        if candidates is not None:
-            move_ghosts(node, spread(candidates, GHOSTS))
-        node.visible = candidates is not None and self._has_candidates
 
     def _show_light(self, light: Light, tried: np.ndarray | None, text: str) -> None:
         if not self._has_light:
@@ -196,18 +220,12 @@ class EstimateNodes:
     # The verdict
 
     def _judge(self, estimate: EstimatedState) -> None:
-        for n, name in enumerate(estimate.state.names):
-            pose, doubt = estimate.state.poses[n], estimate.doubts[n]
-            self._mark(name, doubt)
-            self._add_bounds(name, pose, float(estimate.position_std[n]), float(estimate.rotation_std[n]), doubt)
+        for n, nodes in enumerate(self._objects.values()):
+            nodes.paint(_DOUBTED if estimate.doubts[n] else _SURE)
+            self._add_bounds(estimate, n, nodes.vertices)
         self._add_words(estimate)
         within = f"± {_two_digits(np.rad2deg(_SIGMAS * estimate.light_std))}° ({_SIGMAS:.0f}σ)"
         self._show_light(estimate.state.light, None, f"estimated light {within}")
-
-    def _mark(self, name: str, doubt: str) -> None:
-        self._guesses[name].batched_colors = self._tracked[name].batched_colors = np.array(
-            _DOUBTED if doubt else _SURE, np.uint8
-        )
 
     def _add_words(self, estimate: EstimatedState) -> None:
         """How sure each pose is, or why it is doubted, above the object and clear of all names."""
@@ -218,7 +236,8 @@ class EstimateNodes:
             text = f"± {_two_digits(far_mm)} mm, ± {_two_digits(turn_deg)}° ({_SIGMAS:.0f}σ)"
             text = f"DOUBTFUL: {estimate.doubts[n]}" if estimate.doubts[n] else text
             texts.append(text if name in standing else f"{self._library.label(name)}: {text}")
-            anchors.append(pose.position + np.array([0, 0, top_m(self._meshes[name][0], pose.quaternion) + _LABEL_M]))
+            height_m = top_m(self._objects[name].vertices, pose.quaternion) + _LABEL_M
+            anchors.append(pose.position + np.array([0, 0, height_m]))
         places = separated(np.array(anchors).reshape(-1, 3), texts, tuple(standing.values()))
         self._verdicts += [
             self._scene.add_label(
@@ -231,10 +250,11 @@ class EstimateNodes:
             for name, text, place in zip(estimate.state.names, texts, places, strict=True)
         ]
 
-    def _add_bounds(self, name: str, pose: Pose, position_std: float, rotation_std: float, doubt: str) -> None:
-        """A ball of two standard deviations on the object's top, and a sector of two around its heading."""
-        scene, (vertices, _) = self._scene, self._meshes[name]
-        colour = _DOUBTED if doubt else _SURE
+    def _add_bounds(self, estimate: EstimatedState, n: int, vertices: Float[np.ndarray, "P 3"]) -> None:
+        """A ball of two standard deviations on an object's top, and a sector of two around its heading."""
+        scene, name, pose = self._scene, estimate.state.names[n], estimate.state.poses[n]
+        position_std, rotation_std = float(estimate.position_std[n]), float(estimate.rotation_std[n])
+        colour = _DOUBTED if estimate.doubts[n] else _SURE
         top = pose.position + np.array([0.0, 0.0, top_m(vertices, pose.quaternion)])
         ball_m = float(np.clip(_SIGMAS * position_std, _LEAST_BALL_M, _MOST_BALL_M))
         turn_rad = float(np.clip(_SIGMAS * rotation_std, _LEAST_TURN_RAD, _MOST_TURN_RAD))
