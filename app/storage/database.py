@@ -2,7 +2,8 @@
 
 One process at a time: a lock file keeps a second service out, which would take the first one's jobs for dead.
 What was accepted is on the disk before its caller hears of it. What has happened anyway, such as a push, is remembered
-while the disk refuses, and written with the next write or `retry` that it takes.
+while the disk refuses, and written with the next write or `retry` that it takes. Nothing is accepted once the file is
+not what was opened any more: moved, replaced, emptied or damaged by somebody else.
 
 A file of an older version is migrated, with a copy kept beside it. One that a newer version wrote, or that is damaged,
 is renamed and an empty one takes its place: a service that does not start helps nobody, and nothing is deleted.
@@ -16,6 +17,7 @@ import json
 import logging
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import astuple, dataclass
 from datetime import UTC, datetime
@@ -67,6 +69,9 @@ _READ_BY_EVERY_VERSION = (
 _SCENE_COLUMNS: tuple[str, ...] = ("id", "seed", "created_at", "image_size", "initial", "state", "time_s", "revision")
 _SENSELESS = (ValueError, TypeError, RecursionError)  # what reading a row raises if it makes no sense
 _Count = Annotated[int, Field(ge=0)]
+_MADE_BY_SERVICES = ("collections", "goals", "photos", "sets")  # folders that nothing else makes
+PUT_BACK = "put it back, or stop the service and restore a backup"
+_CHECK_S = 600.0  # between two looks at a file that nobody seems to have changed
 Statement = tuple[str, tuple[Any, ...]]
 _log = logging.getLogger(__name__)
 
@@ -79,10 +84,18 @@ class DataDirectoryInUse(OsfError):
 
 
 class CannotStore(OsfError):
-    """The data directory cannot be written."""
+    """The data directory cannot be written.
 
-    def __init__(self, path: Path, reason: str) -> None:
-        super().__init__(f"{path} cannot be written ({reason}); free some space or choose another data directory.")
+    Args:
+        path: what cannot be written.
+        reason: why.
+        advice: what to do.
+    """
+
+    def __init__(
+        self, path: Path, reason: str, advice: str = "free some space or choose another data directory"
+    ) -> None:
+        super().__init__(f"{path} cannot be written ({reason}); {advice}.")
 
 
 class UnusableDatabase(CorruptFile):
@@ -119,7 +132,8 @@ def check_data_dir(data_dir: Path) -> None:
         DataDirectoryInUse, CorruptFile, CannotStore: as `Store`.
     """
     with _claim(data_dir), contextlib.suppress(UnusableDatabase):
-        open_database(data_dir / FILE).close()
+        if (data_dir / FILE).exists():
+            open_database(data_dir / FILE).close()
 
 
 class Store:
@@ -144,6 +158,8 @@ class Store:
         self._lock_file = _claim(data_dir)
         try:
             self._database = self._open()
+            self._files = identities(self._path, self._path.with_name(f"{FILE}-wal"))
+            self._left_as, self._checked_at = _stamp(self._path), time.monotonic()
         except BaseException:
             self._lock_file.close()
             raise
@@ -181,6 +197,8 @@ class Store:
         return None
 
     def _open(self) -> sqlite3.Connection:
+        if not self._path.exists() and any(any(self._path.parent.glob(f"{name}/*")) for name in _MADE_BY_SERVICES):
+            self._set_aside.append(SetAside("database", "", "", "it is missing", now_utc()))
         try:
             return open_database(self._path)
         except UnusableDatabase as error:
@@ -217,6 +235,7 @@ class Store:
             return number
 
     def _commit(self, statements: list[Statement]) -> int:
+        self._check_file()
         number = 0
         try:
             self._database.execute("BEGIN IMMEDIATE")
@@ -227,7 +246,32 @@ class Store:
             with contextlib.suppress(sqlite3.DatabaseError):  # some failures have ended the transaction already
                 self._database.execute("ROLLBACK")
             raise CannotStore(Path(FILE), str(error)) from error
+        self._left_as = _stamp(self._path)
         return number
+
+    def _check_file(self) -> None:
+        """Refuse to write what would be gone at the next start.
+
+        The pages of a file that somebody else has changed are read anew, and now and then those of one that seems
+        unchanged; the rest costs microseconds.
+
+        Raises:
+            CannotStore: if another file, or none, has the name of the one that was opened, or if it is damaged.
+        """
+        reason = None
+        if identities(*self._files) != self._files:
+            reason = "it, its log or the data directory was moved, deleted or replaced while the service runs"
+        elif self._path.stat().st_size == 0:  # SQLite would delete the log if it were opened
+            reason = "it was emptied while the service runs"
+        elif _stamp(self._path) != self._left_as or time.monotonic() - self._checked_at > _CHECK_S:
+            try:
+                check_database(self._path)
+            except CorruptFile:
+                reason = "it was damaged while the service runs"
+            else:
+                self._left_as, self._checked_at = _stamp(self._path), time.monotonic()
+        if reason is not None:
+            raise CannotStore(Path(FILE), reason, PUT_BACK)
 
     def _read(self, sql: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         with self._lock:
@@ -361,6 +405,25 @@ class Store:
             self._write(_note(entry), (f"DELETE FROM {kind}s WHERE rowid = ?", (rowid,)))
 
 
+def identities(*paths: Path) -> dict[Path, tuple[int, int] | None]:
+    """Return what tells a file or folder from any other that takes its name; None where there is none."""
+    found: dict[Path, tuple[int, int] | None] = dict.fromkeys(paths)
+    for path in paths:
+        with contextlib.suppress(OSError):
+            state = path.stat()
+            found[path] = state.st_dev, state.st_ino
+    return found
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Return what changes whenever a file is written; None if there is none."""
+    try:
+        state = path.stat()
+    except OSError:
+        return None
+    return state.st_size, state.st_mtime_ns
+
+
 def _claim(data_dir: Path) -> IO[str]:
     """The lock file of a data directory, held until it is closed."""
     try:
@@ -389,7 +452,7 @@ class SetAside:
 
     Attributes:
         kind: "scene", "job" or "database".
-        id: identifier, or the name that a whole file has now.
+        id: identifier, or the name that a whole file has now; empty if that was missing.
         row: all that was stored, as JSON; empty for a file.
         reason: why it makes no sense.
         at: UTC, ISO 8601.
@@ -404,6 +467,8 @@ class SetAside:
     @property
     def sentence(self) -> str:
         """What happened, for people."""
+        if self.kind == "database" and not self.id:
+            return f"{FILE} cannot be used: {self.reason}; scenes and jobs are gone, and an empty one took its place."
         if self.kind == "database":
             return f"{FILE} cannot be used: {self.reason}; it is named {self.id} now, and an empty one took its place."
         return f"The stored {self.kind} {shown(self.id)} makes no sense and was set aside: {self.reason}."
@@ -469,13 +534,15 @@ def _job_of_row(text: str, job: str | None = None) -> dict[str, Any]:
 
 
 def check_database(path: Path) -> int:
-    """The version of a database file; 0 if it is empty.
+    """Return the version of a database file; 0 if there is none.
 
     Raises:
-        UnusableDatabase: if it is damaged, or a newer version wrote it.
+        UnusableDatabase: if it is damaged or has no bytes, or a newer version wrote it.
         CorruptFile: if it is another program's.
         CannotStore: if it cannot be opened.
     """
+    if _stamp(path) is not None and path.stat().st_size == 0:  # opened, it would be a new one, and its log deleted
+        raise UnusableDatabase(path, "empty", "it is empty")
     with _connected(path) as database:
         version = database.execute("PRAGMA user_version").fetchone()[0]
         owner = database.execute("PRAGMA application_id").fetchone()[0]
@@ -595,6 +662,7 @@ def _migrated(path: Path, version: int) -> sqlite3.Connection:
             steps = "".join(sql for target, sql in _MIGRATIONS if target > version)
             marks = f"PRAGMA application_id = {_APPLICATION_ID}; PRAGMA user_version = {SCHEMA_VERSION};"
             database.executescript(f"BEGIN IMMEDIATE; {marks} {steps} COMMIT;")
+        database.execute("SELECT count(*) FROM sqlite_master").fetchone()  # the log is there from now on
     except BaseException:
         database.close()
         raise

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from app.storage.database import PUT_BACK, CannotStore, identities
 from osfcore.errors import OsfError
 
 FRESH_S = 30.0  # a figure that is older is measured anew with the next request
@@ -69,6 +70,7 @@ class StorageMeter:
 
     def __init__(self, data_dir: Path, max_bytes: int = 0, min_free_bytes: int = 0) -> None:
         self._data_dir = data_dir
+        self._identity = identities(data_dir)
         self.max_bytes = max_bytes
         self.min_free_bytes = min_free_bytes
         self._lock = threading.Lock()
@@ -119,7 +121,7 @@ class StorageMeter:
         """Why nothing more may be written, by the latest figures; None if it may."""
         try:
             self.check_room(wait_s=0)
-        except StorageFull as error:
+        except (StorageFull, CannotStore) as error:
             return str(error)
         return None
 
@@ -131,7 +133,11 @@ class StorageMeter:
 
         Raises:
             StorageFull: if the directory holds too much, or too little is free on its disk.
+            CannotStore: if another directory, or none, has its name now.
         """
+        if identities(self._data_dir) != self._identity:
+            reason = "it was moved, deleted or replaced while the service runs"
+            raise CannotStore(Path("The data directory"), reason, PUT_BACK)
         free = self.free_bytes
         if free < self.min_free_bytes:
             limit = f"{_size(self.min_free_bytes)} must stay free (OSF_MIN_FREE_BYTES)"

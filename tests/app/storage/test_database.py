@@ -2,6 +2,7 @@ import contextlib
 import json
 import os
 import random
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -105,6 +106,59 @@ def test_jobs_come_back_in_order(store):
     store.save_job("a", 2, {"x": 2})
     store.save_job("b", 1, {"x": 3})
     assert store.jobs() == ((1, {"x": 3}), (2, {"x": 2}))
+
+
+def garbled(path):
+    with path.open("r+b") as file:
+        file.seek(3 * 4096)
+        file.write(b"\xa5" * (3 * 4096))
+
+
+def replaced_by_a_copy(path):
+    copy = path.with_name("copy")
+    shutil.copyfile(path, copy)
+    copy.replace(path)
+
+
+DAMAGE = {
+    "deleted": Path.unlink,
+    "emptied": lambda path: os.truncate(path, 0),
+    "cut off": lambda path: os.truncate(path, path.stat().st_size // 2),
+    "garbled": garbled,
+    "replaced": replaced_by_a_copy,
+    "log deleted": lambda path: path.with_name(f"{path.name}-wal").unlink(),
+    "folder renamed": lambda path: path.parent.rename(path.parent.with_name("elsewhere")),
+}
+
+
+@pytest.fixture
+def filled(tmp_path):
+    """A database of which most is in the file itself, open."""
+    with contextlib.closing(Store(tmp_path / "data")) as store:
+        for number in range(200):
+            store.save_job(str(number), number, {"x": "y" * 200})
+    with contextlib.closing(Store(tmp_path / "data")) as store:
+        yield store
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_nothing_is_accepted_that_would_be_gone_at_the_next_start(filled, tmp_path, damage):
+    filled.save_job("before", 200, {})
+    assert filled.probe() is None
+    damage(tmp_path / "data" / FILE)
+    with pytest.raises(CannotStore):
+        filled.save_job("after", 201, {})
+    assert FILE in filled.probe()
+    filled.save_job("before", 200, {"is": "done"}, can_wait=True)
+    assert filled.unwritten == 1
+
+
+def test_a_data_folder_that_is_put_back_is_written_to_again(filled, tmp_path):
+    (tmp_path / "data").rename(tmp_path / "elsewhere")
+    filled.save_job("a", 200, {}, can_wait=True)
+    (tmp_path / "elsewhere").rename(tmp_path / "data")
+    assert filled.probe() is None
+    assert (filled.unwritten, len(filled.jobs())) == (0, 201)
 
 
 def test_a_second_service_is_kept_out_until_the_first_leaves(tmp_path):
@@ -348,6 +402,24 @@ def put_aside(tmp_path, name, reason):
     assert (store.jobs(), store.scenes()) == ((), ((), None))
     store.save_job("new", 1, {})
     store.close()
+
+
+def test_a_file_of_no_bytes_is_put_aside_with_its_log(tmp_path):
+    (tmp_path / f"{FILE}-wal").write_bytes(b"what was written last")
+    (tmp_path / FILE).write_bytes(b"")
+    put_aside(tmp_path, f"{FILE}.empty", "it is empty")
+    assert (tmp_path / f"{FILE}.empty-wal").read_bytes() == b"what was written last"
+
+
+@pytest.mark.parametrize("folder", ["goals", "photos", "collections", "sets"])
+def test_a_database_that_is_missing_where_a_service_has_worked_is_reported(tmp_path, folder):
+    (tmp_path / folder / "a").mkdir(parents=True)
+    with contextlib.closing(Store(tmp_path)) as store:
+        (entry,) = store.set_aside
+        assert (entry.kind, entry.id) == ("database", "")
+        assert entry.reason in entry.sentence
+    with contextlib.closing(Store(tmp_path)) as store:
+        assert store.set_aside == ()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ import threading
 
 import pytest
 
+from app.storage.database import CannotStore
 from app.storage.usage import StorageFull, StorageMeter, folder_bytes
 
 GIB = 1 << 30
@@ -101,3 +102,21 @@ def test_a_walk_that_is_to_end_ends(tmp_path):
     stop.set()
     assert folder_bytes(tmp_path, stop) == 0
     assert folder_bytes(tmp_path / "nowhere") == 0
+
+
+def test_nothing_more_is_taken_in_once_the_data_directory_is_another_one(tmp_path):
+    data_dir = tmp_path / "data"
+    data_dir.mkdir()
+    meter = StorageMeter(data_dir)
+    meter.check_room()
+    data_dir.rename(tmp_path / "elsewhere")
+    for _ in range(2):  # it is gone, and then a new one has its name
+        with pytest.raises(CannotStore):
+            meter.check_room()
+        assert meter.problem is not None
+        data_dir.mkdir(exist_ok=True)
+    data_dir.rmdir()
+    (tmp_path / "elsewhere").rename(data_dir)
+    meter.check_room()
+    assert meter.problem is None
+    meter.stop()
