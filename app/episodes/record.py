@@ -15,10 +15,7 @@ from jaxtyping import Float
 
 from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE, VIDEO_FILE
 from app.episodes.frames import TILE_PX, frame, read_frames, write_video
-from app.episodes.part_names import PartNames
-from app.episodes.replay_clock import ReplayClock
-from app.episodes.trajectory import write_trajectory
-from app.episodes.trajectory_recorder import TrajectoryRecorder
+from app.episodes.trajectory import ReplayClock, Trajectory, TrajectoryRecorder, read_trajectory, write_trajectory
 from osfcore.control.events import (
     ActionExecuted,
     EpisodeSettings,
@@ -30,9 +27,10 @@ from osfcore.control.events import (
     Stepped,
 )
 from osfcore.control.goal import GoalImage
+from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import SceneState
-from osfcore.io.files import write_atomically, write_json
+from osfcore.io.files import as_mapping, read_json, write_atomically, write_json
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.json_codec import encode
 from osfcore.io.scene_file import ObjectJson, estimated_to_json, state_to_json
@@ -52,6 +50,27 @@ class Table(Protocol):
     def photo(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
         """What a camera would see, the pusher included."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class PartNames:
+    """Parts of an episode by name, ours or those of other packages.
+
+    Attributes:
+        world: what is pushed.
+        estimator: what looks.
+        planner: what plans.
+        cost: what compares futures; None for what the settings say.
+    """
+
+    world: str = "simulated"
+    estimator: str = "ours"
+    planner: str = "mppi"
+    cost: str | None = None
+
+    def to_json(self) -> dict[str, str]:
+        """Those that are named."""
+        return {kind: name for kind, name in asdict(self).items() if name is not None}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -262,3 +281,41 @@ def goal_to_json(goal: GoalFound) -> dict[str, Any]:
     objects = [encode(ObjectJson.of(name, goal.goal.poses[n])) for n, name in enumerate(goal.goal.names)]
     estimate = None if goal.estimate is None else estimated_to_json(goal.estimate)
     return {"objects": objects, "estimate": estimate}
+
+
+# What a finished episode has left
+
+
+class NoEpisode(OsfError):
+    """A folder that holds no episode."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(f"{folder} holds no episode: give a folder that 'osf episode' has left.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FinishedEpisode:
+    """An episode that is over, or was ended early.
+
+    Attributes:
+        folder: where frames and goal image are.
+        trajectory: its course.
+        report: of it.
+    """
+
+    folder: Path
+    trajectory: Trajectory
+    report: Mapping[str, Any]
+
+
+def read_episode(folder: Path) -> FinishedEpisode:
+    """What an episode has left.
+
+    Raises:
+        NoEpisode: if there is none.
+        CorruptFile: if a file is damaged.
+    """
+    if not (folder / TRAJECTORY_FILE).is_file() or not (folder / REPORT_FILE).is_file():
+        raise NoEpisode(folder)
+    trajectory = read_trajectory(folder / TRAJECTORY_FILE)
+    return FinishedEpisode(folder, trajectory, read_json(folder / REPORT_FILE, as_mapping))

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import viser
 
-from app.processes.messages.scene_messages import SceneRecord
-from app.storage.database import now_utc
 from app.viewer.nodes.room import add_room
 from app.viewer.nodes.scene_nodes import SceneNodes
 from osfcore.geometry.states import SceneState
@@ -36,7 +34,7 @@ def write_recording(path: Path, library: AssetLibrary, states: Iterable[SceneSta
     try:
         add_room(server)
         drawing = SceneNodes(server, library)
-        drawing.show(SceneRecord("recording", 0, now_utc(), 128, first, first, 0.0, 0))
+        drawing.show(first)
         serializer = server.get_scene_serializer()
         for state in later:
             serializer.insert_sleep(STEP_S)

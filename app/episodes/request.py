@@ -1,17 +1,22 @@
-"""What an episode in the simulator is asked to be, and the world and goal that this means."""
+"""Episodes in the simulator, without the service: what is asked for, the world and goal that this means, the run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from app.episodes.part_names import PartNames
-from osfcore.control.events import EpisodeSettings
+from app.episodes.file_names import RECORDING_FILE
+from app.episodes.progress import note_of
+from app.episodes.record import About, EpisodeRecord, PartNames
+from osfcore.control.closed_loop import Episode
+from osfcore.control.estimators import ESTIMATOR, ESTIMATORS, EpisodeParts, load_scene_models
+from osfcore.control.events import ActionExecuted, EpisodeSettings, Event, Stepped
 from osfcore.control.goal import GoalImage
 from osfcore.control.world import SimulatedWorld
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
@@ -25,7 +30,9 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.photo.found_scene import FoundScene
 from osfcore.photo.table_layout import TableLayout, layout_of
 from osfcore.planning.costs import PoseGoal
+from osfcore.planning.parts import COST, COSTS, PLANNER, PLANNERS
 from osfcore.plugins import part_factory
+from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import WORLD, WORLDS, Tabletop, WorldInputs
 from osfcore.world.tasks import arranged_goal, random_goal
@@ -202,3 +209,72 @@ def read_goal(path: Path, camera: Camera) -> GoalImage:
         if image.mode not in _MODES:
             raise CorruptFile(path, "it is no image of 8 bits a channel")
         return GoalImage(resized, np.asarray(image.convert("RGB"), np.float32) / 255)
+
+
+def parts_of(names: PartNames, data_dir: Path) -> EpisodeParts:
+    """What estimates, plans and compares.
+
+    Args:
+        names: of the parts.
+        data_dir: from which estimators are made.
+
+    Raises:
+        UnknownName: if there is no part of a name.
+        BrokenPlugin: if another package's cannot be used.
+    """
+    cost = None if names.cost is None else part_factory(COST, names.cost, COSTS)
+    estimators = part_factory(ESTIMATOR, names.estimator, ESTIMATORS)(data_dir)
+    return EpisodeParts(estimators, part_factory(PLANNER, names.planner, PLANNERS), cost)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class EpisodeStep:
+    """How far an episode is.
+
+    Attributes:
+        done: actions executed.
+        total: actions at most, as known so far.
+        note: what is being done.
+        event: what just happened, if anything did.
+        report: with the last step only.
+    """
+
+    done: int
+    total: int
+    note: str
+    event: Event | None = None
+    report: dict[str, Any] | None = None
+
+
+def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
+    """Run an episode; the last step brings the report, and the folder holds everything.
+
+    Raises:
+        OsfError: if the order cannot be met, or the disk refuses.
+    """
+    from app.episodes.recording import write_recording
+
+    total = order.settings.steps
+    yield EpisodeStep(0, total, "Loading fields and setting the table")
+    parts, begin = parts_of(order.parts, order.data_dir), given(order)
+    try:
+        assets = AssetLibrary(order.data_dir / "objects")
+        names = begin.world.truth().names
+        models = load_scene_models(names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device)
+        symmetries = {name: assets.info(name).symmetry for name in names}
+        about = About(order.seed, order.settings, begin.truth, begin.moved, symmetries, parts=order.parts)
+        record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
+        rng = stream_rng(order.seed, Stream.EPISODE)
+        done, note = 0, ""
+        for event in Episode(begin.world, models, begin.goal, order.settings, rng, parts=parts).run():
+            record.take(event)
+            done = event.number if isinstance(event, ActionExecuted) else done
+            total = event.steps if isinstance(event, Stepped) else total
+            note = note_of(event) or note
+            yield EpisodeStep(done, total, note, event)
+        yield EpisodeStep(done, total, "Writing video and recording")
+        report = record.finish()
+        write_recording(order.out / RECORDING_FILE, assets, record.states)
+        yield EpisodeStep(done, total, str(report["text"]), report=report)
+    finally:
+        begin.world.close()

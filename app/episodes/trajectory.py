@@ -8,21 +8,26 @@ from __future__ import annotations
 
 import io
 import zipfile
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from app.processes.plan_summary import PlanSketch
+from app.processes.plan_summary import PlanSketch, sketch_of
+from osfcore.control.events import ActionExecuted, Event, GoalFound, Looking, Planning, Stepped
 from osfcore.errors import CorruptFile
+from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_conjugate, quaternion_exp, quaternion_log, quaternion_multiply
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import EstimatedState, SceneState
+from osfcore.geometry.workspace import STEP_S
 from osfcore.io.files import write_atomically
+from osfcore.planning.mppi import PlanRound
 
 LookAt = Literal["first", "goal"]
 LOOKS: tuple[LookAt, ...] = ("first", "goal")
@@ -252,3 +257,182 @@ def _split(rows: np.ndarray, lengths: Int[np.ndarray, "P"]) -> list[np.ndarray]:
 def _small(name: str, array: np.ndarray) -> np.ndarray:
     """In single precision, but for lights: rounded, one that is as low as may be would be too low."""
     return array.astype(np.float32) if array.dtype == np.float64 and not name.endswith("/light") else array
+
+
+# Keeping the course of an episode as its events come
+
+
+CANDIDATES = 24  # kept of each object
+_MOST_LOOKS = 64  # kept of each look; of more, every other one is dropped
+
+
+class Truth(Protocol):
+    """What knows where everything truly is."""
+
+    def truth(self) -> SceneState:
+        """The true state now."""
+        ...
+
+
+class TrajectoryRecorder:
+    """Keeps what is worth drawing again of an episode.
+
+    Args:
+        start: the true state before the first action.
+
+    Attributes:
+        states: true ones, at the beginning and after each action.
+    """
+
+    states: list[SceneState]
+
+    def __init__(self, start: SceneState) -> None:
+        self.states = [start]
+        self._goal: Pose | None = None
+        self._looks: dict[str, _Thinned] = {}
+        self._rounds: list[Round] = []
+        self._plan: PlanRound | None = None
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The course so far."""
+        looks = tuple(look for thinned in self._looks.values() for look in thinned.kept)
+        return Trajectory(tuple(self.states), self._goal, looks, tuple(self._rounds))
+
+    def take(self, event: Event, table: Truth) -> None:
+        """Note an event, and where everything truly is after an action."""
+        names = self.states[0].names
+        match event:
+            case Looking() if event.look == "first" or event.look == "goal":
+                self._looks.setdefault(event.look, _Thinned()).add(_frame(event.look, event.step))
+            case GoalFound(goal):
+                self._goal = goal.poses[[goal.names.index(name) for name in names]]
+            case Planning():
+                self._plan = event.round
+            case ActionExecuted():
+                self.states.append(table.truth())
+            case Stepped(number, _, estimate):
+                plan = None if self._plan is None else sketch_of(number, self._plan)
+                self._rounds.append(Round(number, estimate, plan))
+                self._plan = None
+            case _:
+                pass
+
+
+class _Thinned:
+    """At most so many of a sequence whose length is not known beforehand, evenly spaced, and the last one."""
+
+    def __init__(self) -> None:
+        self._every, self._count = 1, 0
+        self._frames: list[LookFrame] = []
+        self._last: LookFrame | None = None
+
+    def add(self, frame: LookFrame) -> None:
+        if self._count % self._every == 0:
+            self._frames.append(frame)
+        if len(self._frames) > _MOST_LOOKS:
+            self._frames, self._every = self._frames[::2], 2 * self._every
+        self._count, self._last = self._count + 1, frame
+
+    @property
+    def kept(self) -> list[LookFrame]:
+        last = self._last
+        return self._frames if last is None or self._frames[-1] is last else [*self._frames, last]
+
+
+def _frame(look: LookAt, step: EstimateStep) -> LookFrame:
+    progress = step.progress
+    count = len(step.state.names)
+    candidates = Pose(np.zeros((0, count, 3)), np.zeros((0, count, 4)))
+    if step.candidates is not None:
+        tried = len(step.candidates.position)
+        candidates = step.candidates[np.unique(np.linspace(0, tried - 1, min(CANDIDATES, tried)).astype(int))]
+    done = min(progress.done / max(progress.total, 1), 1.0)
+    return LookFrame(look, done, step.loss, step.state, candidates)
+
+
+# When what is on view in a replay: looks in short, a moment for each plan, pushes in real time
+
+
+LOOK_S = {"first": 3.0, "goal": 1.6}
+_GLANCE_S = 0.6  # for a look whose result was there at once
+PLAN_S, REST_S = 0.35, 0.05  # a plan is on view before its actions, and the new estimate after them
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Moment:
+    """What is on view at one moment.
+
+    Attributes:
+        action: executed so far; between two whole numbers one is being executed.
+        look: an estimator at work; None after the looks.
+        estimate: the last round that is over; None before the first.
+        plan: the round whose plan is being followed; None where there is none.
+        planned: how much of the plan's future is played, as a share.
+    """
+
+    action: float
+    look: LookFrame | None = None
+    estimate: Round | None = None
+    plan: Round | None = None
+    planned: float = 0.0
+
+
+class ReplayClock:
+    """The times of one trajectory.
+
+    Args:
+        trajectory: of an episode, perhaps of one that goes on.
+
+    Attributes:
+        looks_s: how long the looks take [s].
+        step_s: when each round is over, from the beginning of the replay [s]; the first one right after the looks.
+    """
+
+    looks_s: float
+    step_s: tuple[float, ...]
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self._trajectory = trajectory
+        self._looks: list[tuple[float, float, list[LookFrame]]] = []  # with their beginnings and lengths
+        end_s = 0.0
+        for look in LOOKS:
+            frames = [frame for frame in trajectory.looks if frame.look == look]
+            if frames:
+                length_s = LOOK_S[look] if len(frames) > 1 else _GLANCE_S
+                self._looks.append((end_s, length_s, frames))
+                end_s += length_s
+        self.looks_s = end_s
+        ends, before = [], 0
+        for number, round_ in enumerate(trajectory.rounds):
+            end_s += 0.0 if number == 0 else PLAN_S + STEP_S * (round_.action - before) + REST_S
+            before = round_.action
+            ends.append(end_s)
+        self.step_s = tuple(ends)
+
+    @property
+    def length_s(self) -> float:
+        """Of the whole replay."""
+        return self.step_s[-1] if self.step_s else self.looks_s
+
+    def moment(self, at_s: float) -> Moment:
+        """What is on view at a time; the first or last moment for times out of range."""
+        rounds = self._trajectory.rounds
+        if at_s < self.looks_s or not rounds:
+            return self._looking(at_s)
+        number = min(bisect_left(self.step_s, at_s - 1e-9), len(rounds) - 1)
+        if number == 0 or at_s >= self.step_s[number] - 1e-9:
+            return Moment(float(rounds[number].action), estimate=rounds[number])
+        before, now = rounds[number - 1], rounds[number]
+        spent_s = at_s - self.step_s[number - 1] - PLAN_S
+        action = min(before.action + max(spent_s, 0.0) / STEP_S, float(now.action))
+        plan = now if now.plan is not None else None
+        return Moment(action, None, before, plan, min(max(1 + spent_s / PLAN_S, 0.0), 1.0))
+
+    def _looking(self, at_s: float) -> Moment:
+        for begin_s, length_s, frames in reversed(self._looks):
+            if at_s >= begin_s or begin_s == 0:
+                share = min(max((at_s - begin_s) / length_s, 0.0), 1.0)
+                frame = min(frames, key=lambda frame: abs(frame.done - share))
+                return Moment(0.0, look=frame)
+        return Moment(0.0)

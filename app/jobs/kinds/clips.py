@@ -11,7 +11,7 @@ from app.jobs.kind import JobKind
 from osfcore.io.json_codec import Entry, Text
 
 if TYPE_CHECKING:
-    from app.episodes.clip.clip import ClipStep
+    from app.episodes.clip import ClipStep
     from app.jobs.context import JobContext
 
 _THREADS = 2  # the parts of the view
@@ -19,7 +19,7 @@ _THREADS = 2  # the parts of the view
 
 def clip_job(params: dict[str, Any], place: JobContext) -> Iterator[ClipStep]:
     """Draw the episode named "episode"; raises what `clip_of` does."""
-    from app.episodes.clip.clip import clip_of
+    from app.episodes.clip import clip_of
 
     folder = place.folder.parent / params["episode"]
     with ThreadPoolExecutor(_THREADS) as executor:

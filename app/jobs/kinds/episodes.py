@@ -91,9 +91,9 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
         OsfError: if an object has no field, the goal does not fit, the simulation is gone, or the disk refuses.
     """
     from app.episodes.look_pictures import LookPictures
+    from app.episodes.progress import TimeLeft
     from app.episodes.record import About, EpisodeRecord
     from app.episodes.recording import write_recording
-    from app.episodes.time_left import TimeLeft
     from app.jobs.kinds.remote_world import RemoteWorld
     from osfcore.control.closed_loop import Episode
     from osfcore.control.goal import GoalImage
@@ -192,7 +192,7 @@ def use_one_thread() -> None:
 
 def _progress_after(before: EpisodeProgress, event: Event) -> EpisodeProgress:
     """How far an episode is after an event."""
-    from app.episodes.event_notes import note_of, stage_of
+    from app.episodes.progress import note_of, stage_of
     from app.processes.plan_summary import sketch_of
     from osfcore.control.events import ActionExecuted, Finished, Observed, Planning, Stepped
 
@@ -285,7 +285,6 @@ EPISODE = JobKind(
     params=EpisodeParams,
     preloads=(
         "osfcore.world.tabletop", "osfcore.control.closed_loop", "osfcore.control.estimators",
-        "app.jobs.kinds.remote_world", "app.episodes.record", "app.episodes.recording",
     ),
     uses_physics=True,
     keeps_steps=True,

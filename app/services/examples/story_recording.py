@@ -14,10 +14,8 @@ from PIL import Image
 
 from app.episodes.file_names import FRAMES_FOLDER, PREPARED_FILE, REPORT_FILE, TRAJECTORY_FILE
 from app.episodes.frames import TILE_PX, part_of, read_frames
-from app.episodes.headless import EpisodeStep, run_episode
-from app.episodes.replay_clock import LOOK_S, ReplayClock
-from app.episodes.request import EpisodeOrder
-from app.episodes.trajectory import read_trajectory
+from app.episodes.request import EpisodeOrder, EpisodeStep, run_episode
+from app.episodes.trajectory import LOOK_S, ReplayClock, read_trajectory
 from app.services.examples.presets import Preset
 from app.services.examples.stories import STORY_FILE
 from app.services.goals.goals import GOAL_SIDE

@@ -4,11 +4,10 @@ import json
 import numpy as np
 import pytest
 
-from app.episodes import headless as run
-from app.episodes.event_notes import stage_of
+from app.episodes import request as run
 from app.episodes.file_names import RECORDING_FILE, REPORT_FILE
-from app.episodes.headless import run_episode
-from app.episodes.request import EpisodeOrder
+from app.episodes.progress import stage_of
+from app.episodes.request import EpisodeOrder, run_episode
 from osfcore.control.events import (
     ActionExecuted,
     EpisodeSettings,

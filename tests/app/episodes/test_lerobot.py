@@ -12,8 +12,8 @@ import pytest
 
 from app.cli.main import main
 from app.episodes.file_names import GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
-from app.episodes.finished import NoEpisode
-from app.episodes.lerobot.export import NothingPushed, write_lerobot
+from app.episodes.lerobot import NothingPushed, write_lerobot
+from app.episodes.record import NoEpisode
 from app.episodes.trajectory import Trajectory, write_trajectory
 from osfcore.contrib.export.lerobot import DatasetSize
 from osfcore.errors import CorruptFile, InvalidInput
@@ -177,7 +177,7 @@ def test_the_command_writes_it_into_a_new_folder_alone(folders, library, tmp_pat
     assert main([*command, "--json"]) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert told == {"out": str(out), "episodes": 2, "frames": 5, "tasks": 1}
-    assert main(command) == 1
+    assert main(command) == 2
     assert capsys.readouterr().err == f"osf: output folder is {out}, but it must be new or empty.\n"
 
 

@@ -4,9 +4,9 @@ import threading
 import msgspec
 import numpy as np
 import pytest
+import viser
 import zstandard
 
-from app.episodes import recording
 from app.episodes.recording import write_recording
 from osfcore.errors import CannotWrite
 from osfcore.geometry.light import Light
@@ -43,13 +43,13 @@ def told(content, node, what):
 
 @pytest.fixture
 def servers(monkeypatch):
-    made, build = [], recording.viser.ViserServer
+    made, build = [], viser.ViserServer
 
     def noted(*args, **more):
         made.append(build(*args, **more))
         return made[-1]
 
-    monkeypatch.setattr(recording.viser, "ViserServer", noted)
+    monkeypatch.setattr(viser, "ViserServer", noted)
     return made
 
 

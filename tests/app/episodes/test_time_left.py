@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from app.episodes.time_left import TimeLeft
+from app.episodes.progress import TimeLeft
 from osfcore.control.events import ActionExecuted, Finished, Looking, Stepped
 from osfcore.estimation.steps import EstimateStep
 from osfcore.progress import Progress

@@ -1,9 +1,19 @@
 import numpy as np
 import pytest
 
-from app.episodes.replay_clock import LOOK_S, PLAN_S, REST_S, ReplayClock
-from app.episodes.trajectory import LookFrame, Round, Trajectory, read_trajectory, write_trajectory
-from app.episodes.trajectory_recorder import CANDIDATES, TrajectoryRecorder
+from app.episodes.trajectory import (
+    CANDIDATES,
+    LOOK_S,
+    PLAN_S,
+    REST_S,
+    LookFrame,
+    ReplayClock,
+    Round,
+    Trajectory,
+    TrajectoryRecorder,
+    read_trajectory,
+    write_trajectory,
+)
 from app.processes.plan_summary import PlanSketch
 from osfcore.control.events import ActionExecuted, Looking, Observed, Stepped
 from osfcore.errors import CorruptFile

@@ -7,9 +7,24 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from app.episodes.clip.clip import CARD_S, FPS, LONGEST_S, PAUSE_S, ClipFacts, NoClip, clip_of, write_clip
-from app.episodes.clip.layout import HEIGHT, VIEW, WIDTH, Layout, closing_card, length_text
-from app.episodes.clip.scene_view import GOLD, SceneView
+from app.episodes.clip import (
+    CARD_S,
+    FPS,
+    GOLD,
+    HEIGHT,
+    LONGEST_S,
+    PAUSE_S,
+    VIEW,
+    WIDTH,
+    ClipFacts,
+    Layout,
+    NoClip,
+    SceneView,
+    clip_of,
+    closing_card,
+    length_text,
+    write_clip,
+)
 from app.episodes.file_names import REPORT_FILE, TRAJECTORY_FILE
 from app.episodes.trajectory import Round, Trajectory, write_trajectory
 from osfcore.errors import CannotWrite

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageOps
 
 from app.episodes.file_names import GOAL_FILE, REPORT_FILE
-from app.episodes.finished import FinishedEpisode, read_episode
+from app.episodes.record import FinishedEpisode, read_episode
 from osfcore.contrib.export.lerobot import (
     GOAL_IMAGE,
     DatasetSize,

@@ -1,48 +1,131 @@
-"""What an MCAP file tells of an episode, in Foxglove's schemas.
+"""Episodes as MCAP files, for Foxglove, Lichtblick, and whatever else reads MCAP.
 
-Topics, on a clock of simulated time that begins at 0, 0.2 s an action:
+Foxglove's quaternions are (x, y, z, w), its colours RGBA in [0, 1].
 
-    /tf                FrameTransforms    from `world` (z up, [m]) to NAME (the truth), `estimate/NAME`, `goal/NAME`,
-                                          `pusher`, `light`, and `goal_camera` (x right, y down, z forward)
-    /scene             SceneUpdate        table, objects with their colours, pusher and lamp, each in its frame
-    /estimate, /goal   SceneUpdate        the objects where they are thought to be, and where they should be
-    /plan              SceneUpdate        the pusher's way in the best future of each plan
-    /goal/image        CompressedImage    the goal, and /goal/calibration (CameraCalibration) its camera
-    /frames            CompressedImage    goal, table and estimate side by side, one for each round
-    /log               Log                what was noticed, and how it ended
+Raises:
+    MissingExtra: on import, if what writes MCAP is not installed.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import foxglove
 import numpy as np
-from foxglove import channels
-from foxglove.messages import (
+from jaxtyping import Float
+from PIL import Image
+
+from app.episodes.file_names import FRAMES_FOLDER, GOAL_FILE
+from app.episodes.record import read_episode
+from app.episodes.trajectory import Round, Trajectory
+from osfcore.extras import need
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, STEP_S, TABLE_SIDE_M
+from osfcore.io.files import reading_png, write_atomically
+from osfcore.objects.asset import TexturedMesh
+from osfcore.objects.asset_library import AssetLibrary
+
+need("mcap", "An MCAP file")
+import foxglove  # noqa: E402
+from foxglove import channels  # noqa: E402
+from foxglove.messages import (  # noqa: E402
     CameraCalibration,
+    Color,
     CompressedImage,
     CubePrimitive,
     CylinderPrimitive,
     FoxgloveMessage,
+    FrameTransform,
     FrameTransforms,
+    LinePrimitive,
+    LinePrimitiveLineType,
     LogLevel,
+    Point3,
+    Quaternion,
+    SceneEntity,
     SceneUpdate,
     SpherePrimitive,
+    Timestamp,
+    TriangleListPrimitive,
+    Vector3,
 )
-from foxglove.messages import Log as LogMessage
-from PIL import Image
+from foxglove.messages import Log as LogMessage  # noqa: E402
+from foxglove.messages import Pose as PoseMessage  # noqa: E402
 
-from app.episodes.file_names import FRAMES_FOLDER, GOAL_FILE
-from app.episodes.mcap.shapes import at_origin, colour_of, entity, line, stamp, time_ns, transform, triangles, vector
-from app.episodes.trajectory import Round, Trajectory
-from osfcore.geometry.cameras import goal_camera
-from osfcore.geometry.poses import Pose
-from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
-from osfcore.io.files import reading_png
-from osfcore.objects.asset import TexturedMesh
+Rgba = tuple[float, float, float, float]
+_NANOSECONDS = 1_000_000_000
+_LINE_PX = 2.0
+
+
+def time_ns(action: int) -> int:
+    """Simulated time after some actions [ns]."""
+    return round(action * STEP_S * _NANOSECONDS)
+
+
+def stamp(action: int) -> Timestamp:
+    """The same as messages have it."""
+    return Timestamp(*divmod(time_ns(action), _NANOSECONDS))
+
+
+def transform(child: str, pose: Pose, action: int) -> FrameTransform:
+    """`T_world_child`, after some actions."""
+    w, x, y, z = pose.quaternion.tolist()
+    return FrameTransform(
+        timestamp=stamp(action), parent_frame_id="world", child_frame_id=child,
+        translation=vector(*pose.position.tolist()), rotation=Quaternion(x=x, y=y, z=z, w=w),
+    )  # fmt: skip
+
+
+def entity(name: str, frame: str, action: int = 0, **primitives: Any) -> SceneEntity:  # noqa: ANN401  lists of theirs
+    """Shapes that move with a frame, from after some actions on."""
+    return SceneEntity(id=name, frame_id=frame, frame_locked=True, timestamp=stamp(action), **primitives)
+
+
+def triangles(mesh: TexturedMesh, colour: Rgba | None = None) -> TriangleListPrimitive:
+    """A mesh in its own frame, in one colour or in those that its texture has at the vertices.
+
+    Triangles rather than embedded glTF, of which viewers disagree which axis is up.
+    """
+    points, indices = _points(mesh.vertices), mesh.faces.reshape(-1).tolist()
+    if colour is not None:
+        return TriangleListPrimitive(pose=at_origin(), points=points, indices=indices, color=colour_of(colour))
+    height, width = mesh.texture.shape[:2]
+    columns = (mesh.uv[:, 0] * (width - 1)).round().astype(int)
+    rows = ((1 - mesh.uv[:, 1]) * (height - 1)).round().astype(int)
+    colours = [colour_of((r, g, b, 1.0)) for r, g, b in (mesh.texture[rows, columns] / 255).tolist()]
+    return TriangleListPrimitive(pose=at_origin(), points=points, indices=indices, colors=colours)
+
+
+def line(positions: Float[np.ndarray, "P 3"], colour: Rgba) -> LinePrimitive:
+    """A polyline."""
+    return LinePrimitive(
+        type=LinePrimitiveLineType.LineStrip, pose=at_origin(), thickness=_LINE_PX, scale_invariant=True,
+        points=_points(positions), color=colour_of(colour),
+    )  # fmt: skip
+
+
+def at_origin(height_m: float = 0.0) -> PoseMessage:
+    """A pose at the frame's origin, or above it."""
+    return PoseMessage(position=vector(0.0, 0.0, height_m), orientation=Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+
+
+def vector(x: float, y: float, z: float) -> Vector3:
+    """A vector, or sizes along the axes."""
+    return Vector3(x=x, y=y, z=z)
+
+
+def colour_of(rgba: Rgba) -> Color:
+    """A colour."""
+    r, g, b, a = rgba
+    return Color(r=r, g=g, b=b, a=a)
+
+
+def _points(positions: Float[np.ndarray, "P 3"]) -> list[Point3]:
+    return [Point3(x=x, y=y, z=z) for x, y, z in positions.tolist()]
+
 
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 _TABLE_M, _LAMP_M = 0.02, 0.05  # thickness and width that are drawn
@@ -149,3 +232,34 @@ def log_words(log: Log, report: Mapping[str, Any]) -> None:
     end = report.get("text") or "It was ended early."
     for level, text, action in [*noticed, (LogLevel.Info, end, report.get("steps_done", 0))]:
         log.put("/log", LogMessage(timestamp=stamp(action), level=level, message=text, name="osf"), action)
+
+
+def write_mcap(folder: Path, library: AssetLibrary, path: Path) -> float:
+    """Write what an episode has left in its folder as one file; it appears only when it is whole.
+
+    Args:
+        folder: with `report.json`, `trajectory.npz`, `frames/`, and `goal.png` if the goal was an image.
+        library: meshes of the objects.
+        path: an MCAP file, which is replaced.
+
+    Returns:
+        How long the episode is in simulated time [s].
+
+    Raises:
+        NoEpisode: if there is none.
+        CorruptFile, UnknownName, MissingAssets: if something in the folder is damaged, or an object is not here.
+        CannotWrite: if the disk refuses.
+    """
+    episode = read_episode(folder)
+    trajectory = episode.trajectory
+    meshes = {name: library.load(name).mesh for name in trajectory.names}
+    context, data = foxglove.Context(), io.BytesIO()
+    with foxglove.open_mcap(data, context=context):
+        log = Log(context)
+        log_scene(log, trajectory, meshes)
+        log_transforms(log, trajectory)
+        log_plans(log, trajectory.rounds)
+        log_images(log, folder, trajectory.rounds)
+        log_words(log, episode.report)
+    write_atomically(path, data.getvalue())
+    return STEP_S * (len(trajectory.states) - 1)
