@@ -13,6 +13,7 @@ from app.storage.backup import FOLDERS, MANIFEST, back_up, restore
 from app.storage.database import FILE, SCHEMA_VERSION, Store
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
 from tests.app.conftest import full_disk
+from tests.app.jobs.test_registry import EPISODE
 from tests.app.storage.test_database import change, record
 from tests.support.errors import about
 
@@ -23,7 +24,7 @@ def place(tmp_path):
     place = tmp_path / "data"
     with contextlib.closing(Store(place)) as store:
         store.save_scene(record("a"))
-        store.save_job("j", 1, {"id": "j", "kind": "episode", "params": {}, "state": "running"})
+        store.save_job("j", 1, {"id": "j", "kind": "episode", "params": EPISODE, "state": "running"})
     for name in (*FOLDERS, "downloads", "cache"):
         (place / name / "one" / "deep").mkdir(parents=True)
         (place / name / "one" / "deep" / "file").write_bytes(os.urandom(1000))
