@@ -15,8 +15,52 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Route
 
+from app.api.dependencies import TooManyStreams
+from app.episodes.clip import NoClip
+from app.jobs.kinds.objects import MeshRefused
+from app.jobs.process import JobDied, JobStopped
+from app.jobs.registry import QueueFull, WrongJobState
+from app.processes.pictures.photo_process import PhotoRefused
+from app.processes.process_client import ProcessBusy, ProcessUnavailable
+from app.processes.process_server import InternalError, OutOfMemory
+from app.services.disturber import NoRoomToNudge
+from app.services.episode_results import NoTrajectory
+from app.services.episodes import EpisodeGoesOn, GoalUnknown, NoGoal
+from app.services.estimates import NoImages, NoPrior, NoScene
+from app.services.fields import MissingFields, NoPublishedField, NoTrainedField, ShippedField
+from app.services.goals.goal_checks import GoalRefused
+from app.services.goals.goals import DraftUnsound, NoDraft, NoPhoto, NoTable
+from app.services.image_sets import TooManySets
+from app.services.objects.own_objects import CatalogueObject, ObjectNeeded, ObjectTaken
+from app.services.photos.photo_tables import PhotoDoubtful
+from app.services.photos.table_photos import NotFoundYet, NothingMarked
+from app.services.predictions import NothingToPush
+from app.services.robot import NoPicture, NoRobot, NothingAsked, RobotBusy
+from app.services.runner import SceneNeeded, SetInUse, TrainingAlready, WorkshopInUse
+from app.services.scenes import SceneHeld, TooManyScenes
+from app.services.visitors.driver import NotDriving
+from app.storage.database import CannotStore
 from app.storage.paths import without_places
-from osfcore.errors import OsfError, UnknownName
+from app.storage.records import TooManyGoals, TooManyPhotos
+from app.storage.uploads import UploadNotStored, UploadRefused
+from app.storage.usage import StorageFull
+from app.viewer.push_panel import CannotExecute
+from osfcore.contrib.robots.robot import ConnectionLost, RobotRefused, RobotStopped
+from osfcore.errors import (
+    CannotWrite,
+    CorruptFile,
+    FetchFailed,
+    InvalidInput,
+    MissingAssets,
+    NoRoom,
+    OsfError,
+    OverlappingObjects,
+    UnknownName,
+    WorkerDied,
+)
+from osfcore.extras import MissingExtra
+from osfcore.photo.table_layout import NoPhotographedTable
+from osfcore.plugins import BrokenPlugin
 
 _log = logging.getLogger(__name__)
 
@@ -39,63 +83,6 @@ class Problem(BaseModel):
     errors: list[ProblemPointer] | None = None
 
 
-STATUS_OF_KIND = {
-    "WrongJobState": 409,
-    "SceneHeld": 409,
-    "TooManyScenes": 409,
-    "TooManySets": 409,
-    "SetInUse": 409,
-    "SceneNeeded": 409,
-    "WorkshopInUse": 409,
-    "TrainingAlready": 409,
-    "ShippedField": 409,
-    "NoTrainedField": 409,
-    "ObjectTaken": 409,
-    "ObjectNeeded": 409,
-    "CatalogueObject": 409,
-    "MissingFields": 409,
-    "NoPublishedField": 409,
-    "NoScene": 409,
-    "NoTable": 409,
-    "NoTrajectory": 409,
-    "NoClip": 409,
-    "GoalUnknown": 409,
-    "EpisodeGoesOn": 409,
-    "NotDriving": 409,
-    "NoRobot": 404,
-    "NoPicture": 404,
-    "RobotBusy": 409,
-    "NothingAsked": 409,
-    "ConnectionLost": 503,
-    "RobotRefused": 503,
-    "NoRoomToNudge": 409,
-    "GoalRefused": 409,
-    "NoPhoto": 409,
-    "TooManyPhotos": 409,
-    "NothingMarked": 409,
-    "NotFoundYet": 409,
-    "NoPhotographedTable": 409,
-    "PhotoDoubtful": 409,
-    "NoDraft": 404,
-    "DraftUnsound": 409,
-    "TooManyGoals": 409,
-    "NothingToPush": 409,
-    "NoPrior": 409,
-    "NoImages": 404,
-    "QueueFull": 429,
-    "ProcessUnavailable": 503,
-    "ProcessHangs": 503,
-    "ProcessBusy": 503,
-    "ProcessFrozen": 503,
-    "TooManyStreams": 503,
-    "CannotStore": 507,
-    "StorageFull": 507,
-    "UploadNotStored": 507,
-    "CannotWrite": 507,
-    "CorruptFile": 409,
-    "InternalError": 500,
-    "NotFound": 404,
-}
 _MOST_POINTERS = 20  # mistakes that are told of one request
 _LONGEST_TOLD = 1e9  # numbers below this are repeated in a sentence
 _WORDS = {  # title of each problem, and when routes answer it
@@ -118,6 +105,28 @@ _WORDS = {  # title of each problem, and when routes answer it
 
 class NotFound(OsfError):
     """What the path names does not exist."""
+
+
+_ERRORS: dict[int, tuple[type[OsfError], ...]] = {
+    404: (NotFound, NoRobot, NoPicture, NoDraft, NoImages),
+    409: (
+        CannotExecute, CatalogueObject, CorruptFile, DraftUnsound, EpisodeGoesOn, GoalRefused, GoalUnknown,
+        MissingAssets, MissingExtra, MissingFields, NoClip, NoPhoto, NoPhotographedTable, NoPrior, NoPublishedField,
+        NoRoomToNudge, NoScene, NoTable, NoTrainedField, NoTrajectory, NotDriving, NotFoundYet, NothingAsked,
+        NothingMarked, NothingToPush, ObjectNeeded, ObjectTaken, PhotoDoubtful, RobotBusy, RobotStopped, SceneHeld,
+        SceneNeeded, SetInUse, ShippedField, TooManyGoals, TooManyPhotos, TooManyScenes, TooManySets, TrainingAlready,
+        WorkshopInUse, WrongJobState,
+    ),
+    422: (InvalidInput, MeshRefused, NoGoal, NoRoom, OverlappingObjects, PhotoRefused, UnknownName, UploadRefused),
+    429: (QueueFull,),
+    500: (BrokenPlugin, InternalError),
+    503: (
+        ConnectionLost, FetchFailed, JobDied, JobStopped, OutOfMemory, ProcessBusy, ProcessUnavailable, RobotRefused,
+        TooManyStreams, WorkerDied,
+    ),
+    507: (CannotStore, CannotWrite, StorageFull, UploadNotStored),
+}  # fmt: skip
+STATUSES = {kind: status for status, kinds in _ERRORS.items() for kind in kinds}
 
 
 @contextmanager
@@ -161,8 +170,10 @@ def too_large(most_bytes: int) -> str:
 
 
 def status_of(error: OsfError) -> int:
-    """The HTTP status that says what an error says."""
-    return STATUS_OF_KIND.get(type(error).__name__, 422)
+    """The HTTP status that says what an error says; one of an unknown class is a defect, a mere sentence is not."""
+    if type(error) is OsfError:
+        return 422
+    return next((STATUSES[kind] for kind in type(error).__mro__ if kind in STATUSES), 500)
 
 
 def install(app: FastAPI) -> None:

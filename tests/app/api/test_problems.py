@@ -1,25 +1,68 @@
+import importlib
+import pkgutil
+
 import pytest
 
-from app.api.problems import NotFound, problem, status_of
+import app
+import osfcore
+from app.api.problems import STATUSES, NotFound, problem, status_of
 from app.jobs.registry import QueueFull
-from app.processes.process_client import ProcessUnavailable
-from app.processes.process_server import InternalError
-from osfcore.errors import InvalidInput, OverlappingObjects
+from app.processes.process_client import ProcessHangs, ProcessUnavailable
+from app.processes.process_server import InternalError, OutOfMemory
+from app.storage.uploads import UploadNotStored, UploadRefused
+from osfcore.errors import InvalidInput, MissingAssets, NotThere, OsfError, OverlappingObjects, WorkerDied
+
+# What no request meets
+OF_PROGRAMS = {"CannotListen", "DataDirectoryInUse", "NoEpisode", "NothingPushed", "ServiceError"}
+    "CannotListen",
+    "DataDirectoryInUse",
+    "NoEpisode",
+    "NothingPushed",
+    "ServiceError",
+}  # that no request meets
+
+
+def kinds_of(base):
+    for kind in base.__subclasses__():
+        yield kind
+        yield from kinds_of(kind)
 
 
 @pytest.mark.parametrize(
     ("error", "status"),
     [
+        (OsfError("It cannot be."), 422),
         (InvalidInput("x", 1, "2"), 422),
+        (NotThere("scene"), 422),
         (OverlappingObjects("a", "b", 0.01), 422),
+        (MissingAssets(["025_mug"]), 409),
         (InternalError("simulation", ValueError()), 500),
         (ProcessUnavailable("simulation", "died"), 503),
+        (ProcessHangs("simulation", 9.0), 503),
+        (OutOfMemory("simulation"), 503),
+        (WorkerDied("planner"), 503),
+        (UploadRefused("it is no zip"), 422),
+        (UploadNotStored("it is full"), 507),
         (QueueFull(20), 429),
         (NotFound("no"), 404),
     ],
+    ids=lambda value: type(value).__name__,
 )
 def test_errors_have_the_status_that_says_the_same(error, status):
     assert status_of(error) == status
+
+
+def test_every_error_of_the_program_has_its_status_on_purpose():
+    for package in (app, osfcore):
+        for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+            if not info.name.endswith("__main__"):
+                importlib.import_module(info.name)
+    ours = [kind for kind in kinds_of(OsfError) if kind.__module__.startswith(("app.", "osfcore."))]
+    assert {kind.__name__ for kind in ours if STATUSES.keys().isdisjoint(kind.__mro__)} == OF_PROGRAMS
+
+
+def test_an_error_without_a_status_is_a_defect():
+    assert status_of(type("Unheard", (OsfError,), {})("It cannot be.")) == 500
 
 
 def test_text_that_is_not_unicode_goes_out_anyway():
