@@ -38,7 +38,7 @@ from app.api.bodies import SMALL_BODY_BYTES, CompressionMiddleware, HeadMiddlewa
 from app.api.dependencies import Services, only_the_driver
 from app.api.guards.connection_timeouts import BodyTimeoutMiddleware
 from app.api.guards.security import BodyLimitMiddleware, SecurityMiddleware
-from app.api.guards.token_gate import TokenMiddleware
+from app.api.guards.token_gate import COOKIE, OPEN, TokenMiddleware
 from app.services.service_settings import Settings
 from app.storage.paths import static_folder
 
@@ -60,6 +60,21 @@ _OTHER_MODELS = (
     estimates.EstimateIn, goals.GoalIn,
 )  # fmt: skip
 _STREAM = "text/event-stream"
+_SECURITY = {
+    "token": {"type": "http", "scheme": "bearer", "description": "OSF_TOKEN, where the service has one."},
+    "session": {"type": "apiKey", "in": "cookie", "name": COOKIE, "description": "What /?token=TOKEN sets."},
+}
+_TAGS = {
+    "health": "Whether the service runs.", "metrics": "Figures for Prometheus.", "settings": "What can be set.",
+    "storage": "What the data directory holds.", "objects": "Things that lie on tables.",
+    "fields": "Neural fields of objects, and image sets to train them from.", "scenes": "Tables that are simulated.",
+    "neural": "What the fields say the cameras see.", "presets": "Tables to begin with, each with a goal.",
+    "stories": "Recorded episodes that come with the program.", "goals": "Images of how a table should look.",
+    "photos": "Photographs of tables, and of the board that calibrates a camera.",
+    "episodes": "From a table to its goal, push by push.", "estimates": "Poses and light from images.",
+    "predictions": "What pushes would do.", "jobs": "Long work.", "events": "What happens, as it happens.",
+    "driver": "Which page has the controls.", "views": "What the 3D view of a page shows.", "robot": "A real arm.",
+}  # fmt: skip
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -132,7 +147,17 @@ def _operation_id(route: APIRoute) -> str:
 def _openapi(app: FastAPI) -> dict[str, Any]:
     """The schema with those models that no route returns as such: problems and the events' data."""
     if app.openapi_schema is None:
-        schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        schema = get_openapi(
+            title=app.title,
+            version=app.version,
+            description=app.description,
+            routes=app.routes,
+            tags=[{"name": name, "description": text} for name, text in _TAGS.items()],
+            license_info={"name": "MIT", "identifier": "MIT"},
+            servers=[{"url": "/"}],
+        )
+        schema["security"] = [{}, *({name: []} for name in _SECURITY)]
+        schema["components"]["securitySchemes"] = _SECURITY
         schemas = schema.setdefault("components", {}).setdefault("schemas", {})
         for model in _OTHER_MODELS:
             own = model.model_json_schema(ref_template="#/components/schemas/{model}")
@@ -142,6 +167,9 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             content = path["responses"]["200"].get("content", {})
             if _STREAM in content:  # FastAPI describes it in terms of OpenAPI 3.2, which readers of 3.1 refuse
                 content[_STREAM] = {"schema": {"type": "string"}}
+        for path in OPEN:
+            schema["paths"][path]["get"]["security"] = []
+            del schema["paths"][path]["get"]["responses"]["401"]
         app.openapi_schema = schema
     return app.openapi_schema
 

@@ -17,8 +17,8 @@ from fastapi import Depends, Request
 from pydantic import BaseModel
 from starlette.requests import HTTPConnection
 
+from app.processes.client import ProcessBusy, ProcessClient
 from app.processes.predict_process import predictor_main
-from app.processes.process_client import ProcessBusy, ProcessClient
 from app.processes.render_process import renderer_main
 from app.services.disturber import Disturber
 from app.services.episodes import Episodes

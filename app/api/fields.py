@@ -128,7 +128,8 @@ def get(services: ServicesDep, name: FieldName) -> FieldOut:
     return _out(services, _known_field(services, name))
 
 
-@router.post("/{name}/use", responses=problems(404, 409, 507))
+@router.post("/{name}/use", include_in_schema=False)  # which in OpenAPI is a path that /sets/{set_id} is, too
+@router.patch("/{name}", responses=problems(404, 409, 507))
 def use(services: ServicesDep, name: FieldName, body: UseIn) -> FieldOut:
     """Use a field that was trained here, though it is not as good as the one that is in use."""
     _known_field(services, name)

@@ -20,9 +20,9 @@ from app.episodes.clip import NoClip
 from app.jobs.kinds.objects import MeshRefused
 from app.jobs.process import JobDied, JobStopped
 from app.jobs.registry import QueueFull, WrongJobState
-from app.processes.pictures.photo_process import PhotoRefused
-from app.processes.process_client import ProcessBusy, ProcessUnavailable
-from app.processes.process_server import InternalError, OutOfMemory
+from app.processes.client import ProcessBusy, ProcessUnavailable
+from app.processes.photo_process import PhotoRefused
+from app.processes.server import InternalError, OutOfMemory
 from app.services.disturber import NoRoomToNudge
 from app.services.episode_results import NoTrajectory
 from app.services.episodes import EpisodeGoesOn, GoalUnknown, NoGoal
@@ -286,5 +286,5 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"content": content, "description": _WORDS[status][1]}
-        for status in (400, 403, 413, 421, 422, *statuses)
+        for status in (400, 401, 403, 413, 421, 422, *statuses)
     }

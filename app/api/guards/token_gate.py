@@ -53,7 +53,7 @@ class RateLimit:
 
 COOKIE = "osf_session"
 _LIFE_S = 30 * 24 * 3600
-_OPEN = ("/api/health",)  # whoever runs the service may look whether it lives
+OPEN = ("/api/health",)  # whoever runs the service may look whether it lives
 _REFUSED = "This service needs a token: open its page as /?token=TOKEN, or send the header Authorization: Bearer TOKEN."
 _TOO_MANY = "Too many wrong tokens have come in; wait a moment before the next one."
 _WRONG_PER_S, _WRONG_AT_ONCE = 0.2, 10.0  # from one address
@@ -76,7 +76,7 @@ class TokenMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check and pass on one request."""
-        if scope["type"] == "lifespan" or scope["path"] in _OPEN:
+        if scope["type"] == "lifespan" or scope["path"] in OPEN:
             await self._app(scope, receive, send)
             return
         connection = HTTPConnection(scope)

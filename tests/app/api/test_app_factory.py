@@ -1,3 +1,4 @@
+import itertools
 import re
 
 from app.api.app_factory import create_app
@@ -32,3 +33,24 @@ def test_an_app_can_be_made_without_starting_anything(tmp_path):
     app = create_app(Settings(data_dir=tmp_path / "data"))
     assert not (tmp_path / "data").exists()
     assert app.openapi()["info"]["title"] == "OSF manipulation"
+
+
+def test_the_schema_states_licence_tags_and_who_may_call():
+    schema = create_app().openapi()
+    assert schema["info"]["license"]["identifier"] == "MIT"
+    described = {tag["name"] for tag in schema["tags"] if tag["description"]}
+    assert set(schema["components"]["securitySchemes"]) == {name for need in schema["security"] for name in need}
+    for path, operations in schema["paths"].items():
+        for operation in operations.values():
+            assert set(operation["tags"]) <= described
+            assert ("401" in operation["responses"]) == (path != "/api/health")
+
+
+def test_no_two_paths_of_the_schema_can_be_the_same():
+    """Placeholders stand for any text; at the first place where two paths differ, neither may be one of both."""
+    paths = [path.split("/") for path in create_app().openapi()["paths"]]
+    for one, other in itertools.combinations(paths, 2):
+        if len(one) == len(other):
+            pairs = [(a, b) for a, b in zip(one, other, strict=True) if a != b]
+            crossed = {a.startswith("{") for a, b in pairs if "{" in a + b}
+            assert len(crossed) < 2 or any("{" not in a + b for a, b in pairs), (one, other)

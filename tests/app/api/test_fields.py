@@ -94,7 +94,7 @@ def test_from_a_mesh_to_a_field_that_can_be_seen_and_deleted(service, services):
     other = service.post("/api/fields/006_mustard_bottle/use", json={"job": job["id"]})
     assert "no field of 006_mustard_bottle" in is_problem(other, 409)["detail"]
     is_problem(service.post(f"/api/fields/{GELATIN}/use", json={"job": "nobody"}), 422)
-    used = service.post(f"/api/fields/{GELATIN}/use", json={"job": job["id"]}).json()
+    used = service.patch(f"/api/fields/{GELATIN}", json={"job": job["id"]}).json()
 
     field = service.get(f"/api/fields/{GELATIN}").json()
     assert (field["source"], field["has_mesh"], field["note"]) == ("trained", True, None)

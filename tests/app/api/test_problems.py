@@ -7,19 +7,13 @@ import app
 import osfcore
 from app.api.problems import STATUSES, NotFound, problem, status_of
 from app.jobs.registry import QueueFull
-from app.processes.process_client import ProcessHangs, ProcessUnavailable
-from app.processes.process_server import InternalError, OutOfMemory
+from app.processes.client import ProcessHangs, ProcessUnavailable
+from app.processes.server import InternalError, OutOfMemory
 from app.storage.uploads import UploadNotStored, UploadRefused
 from osfcore.errors import InvalidInput, MissingAssets, NotThere, OsfError, OverlappingObjects, WorkerDied
 
 # What no request meets
 OF_PROGRAMS = {"CannotListen", "DataDirectoryInUse", "NoEpisode", "NothingPushed", "ServiceError"}
-    "CannotListen",
-    "DataDirectoryInUse",
-    "NoEpisode",
-    "NothingPushed",
-    "ServiceError",
-}  # that no request meets
 
 
 def kinds_of(base):
