@@ -277,6 +277,14 @@ def test_one_that_waits_does_not_take_the_view_from_one_that_runs(room):
     assert not room.drawing.is_empty
 
 
+def test_a_former_one_that_is_renamed_does_not_take_the_view(room):
+    room.see(job(), step())
+    room.panel.show(JobChanged(1, job("done", result={"trusted": True})))
+    room.panel.show(JobChanged(2, job("done", name="b", result={"trusted": True})))
+    until(lambda: room.panel.is_idle)
+    assert not room.drawing.is_empty
+
+
 def test_steps_of_jobs_of_other_kinds_are_not_drawn(room):
     other = Job("e", "episode", {"scene": "s", "names": [BOX]}, "running")
     room.panel.show(JobView(other, step()))

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from app.processes.client import ProcessUnavailable
 from app.processes.messages.neural_messages import DrawnView
-from app.processes.process_client import ProcessUnavailable
 from app.viewer.neural_panel import REST_S, STEPS, HiddenNodes, NeuralPanel, Refinement
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from app.processes.client import ProcessUnavailable
 from app.processes.messages.neural_messages import Predicted
 from app.processes.messages.scene_messages import SceneChanged, SceneRecord
-from app.processes.process_client import ProcessUnavailable
 from app.services.event_hub import CurrentScene, Notice
 from app.services.fields import MissingFields
 from app.services.pushes import MAX_ACTIONS, Outcome
