@@ -139,7 +139,7 @@ class BenchDynamicsCommand(_Benchmark):
 
 @dataclass(frozen=True)
 class BenchPlannerCommand(_Benchmark):
-    """Our planner, the paper's and pytorch-mppi's on Push-T, told its true dynamics."""
+    """Our planner, the paper's and pytorch-mppi's on Push-T, given its true dynamics."""
 
     FIGURES: ClassVar[str] = "planner.json"
     tasks: int = 20

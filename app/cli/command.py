@@ -126,7 +126,8 @@ def report_of(steps: Iterable[Any]) -> Any:  # noqa: ANN401  each kind of work h
 
 
 def _progress(step: Step | StepWithProgress) -> Step:
-    return getattr(step, "progress", step)
+    progress: Any = getattr(step, "progress", step)
+    return progress
 
 
 def _follow_with_bar(steps: Iterable[StepT]) -> StepT | None:

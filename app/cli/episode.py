@@ -179,7 +179,7 @@ class Record(DataCommand):
     """Examples, as the page and /api/presets call them; all without it."""
 
     def run(self) -> dict[str, Any]:
-        """Make them one after the other; tells how each episode ended."""
+        """Make them one after the other; return how each episode ended."""
         from app.services.examples.presets import PRESETS, preset
         from app.services.examples.story_recording import record_story
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -148,7 +149,7 @@ class Predict(DataCommand):
     """What computes; auto takes a GPU where there is one."""
 
     def run(self) -> dict[str, Any]:
-        """Predict; the result tells how far each object goes at most [mm], and PSNR by step where it is known."""
+        """Predict; the result has how far each object goes at most [mm], and PSNR by step where it is known."""
         from osfcore.dynamics.rollout import load_push_model
         from osfcore.fields.devices import pick_device
         from osfcore.io.scene_file import read_actions, read_estimated, write_rollouts
@@ -199,7 +200,6 @@ class Predict(DataCommand):
         from osfcore.experiments.visual_prediction import PSNR_FILE, VisualPrediction, show_prediction
         from osfcore.extras import missing
         from osfcore.fields.devices import pick_device
-        from osfcore.io.files import read_json
         from osfcore.render.renderer import SceneRenderer
 
         library, assets = self.trained, self.assets
@@ -210,7 +210,7 @@ class Predict(DataCommand):
         follow(show_prediction(request, renderer, None if lacking else assets))
         if lacking:
             return {"images": str(folder), "psnr": None, "lacking": lacking}
-        return {"images": str(folder), "psnr": read_json(folder / PSNR_FILE, lambda content: content["psnr"])}
+        return {"images": str(folder), "psnr": json.loads((folder / PSNR_FILE).read_text())["psnr"]}
 
 
 def _prediction_text(result: dict[str, Any]) -> Iterator[str]:
@@ -239,7 +239,7 @@ class Render(DataCommand):
     """What computes; auto takes a GPU where there is one."""
 
     def run(self) -> dict[str, Any]:
-        """Render with two by two rays a pixel; the result tells the file and its size."""
+        """Render with two by two rays a pixel; the result has the file and its size."""
         from osfcore.fields.devices import pick_device
         from osfcore.geometry.cameras import default_cameras, goal_camera
         from osfcore.io.image_file import to_uint8, write_png

@@ -220,7 +220,7 @@ class EvaluateDynamicsCommand(ParallelEvaluation):
 
 @dataclass(frozen=True)
 class EvaluateMpcCommand(ParallelEvaluation):
-    """Episodes: tables that shall become what a goal image shows; the same planner told the truth; no action."""
+    """Episodes: tables that shall become what a goal image shows; the same planner given the truth; no action."""
 
     family: Literal["shifted", "turned", "crowded", "relit"] = "shifted"
     """What goals ask for: objects elsewhere; turned as well; in one another's places; photographed in another light."""
@@ -229,7 +229,7 @@ class EvaluateMpcCommand(ParallelEvaluation):
     actions: int = 30
     """Actions of 0.2 s that an episode may have; 30 in the paper."""
     method: Literal["ours", "overhead", "known_light", "nerf", "paper", "foresight"] = "ours"
-    """Whose episodes: ours; with the light taken to be overhead; told the true light; with fields that know of no
+    """Whose episodes: ours; with the light taken to be overhead; given the true light; with fields that know of no
     light; the paper's, as published; visual foresight on predicted video."""
     ours: tuple[Literal["fields", "estimation", "dynamics", "planning"], ...] = ()
     """With --method paper: stages that are replaced by ours."""
@@ -248,7 +248,7 @@ class EvaluateMpcCommand(ParallelEvaluation):
     cost: Literal["pose", "image"] = "pose"
     """Futures are compared with the goal's poses, or rendered and compared with the goal image."""
     oracle: bool = True
-    """Also measure the planner that is told the truth."""
+    """Also measure the planner that is given the truth."""
     oracle_samples: int = 192
     """Sequences of actions in each round of its plans."""
     oracle_tries: int = 8

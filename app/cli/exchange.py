@@ -33,7 +33,7 @@ class ExportScene(DataCommand):
     """Objects as the surfaces of their fields, also where this machine has their meshes."""
 
     def run(self) -> dict[str, Any]:
-        """Export; the result tells which objects are meshes and which are surfaces of fields."""
+        """Export; the result lists the objects that are meshes, and those that are surfaces of fields."""
         from osfcore.io.scene_file import read_scene
 
         suffix = check_out(self.out, ".glb", ".usdz")
@@ -66,7 +66,7 @@ class ExportField(DataCommand):
     """Direction toward a light whose shading is baked into the colours; without it they are the albedo."""
 
     def run(self) -> dict[str, Any]:
-        """Export; the result tells what the colours are."""
+        """Export; the result has the kind of colours."""
         suffix = check_out(self.out, ".glb", ".usdz", ".usdc")
         if suffix == ".glb":
             from osfcore.contrib.export.meshes import field_glb as export
@@ -93,7 +93,7 @@ class ExportSplats(DataCommand):
     """Direction toward the light that is baked in, in the object's frame; from straight above by default."""
 
     def run(self) -> dict[str, Any]:
-        """Export; the result tells how many Gaussians there are."""
+        """Export; the result has the number of Gaussians."""
         from osfcore.contrib.export.splats import field_splats, splats_ply
 
         check_out(self.out, ".ply")
@@ -144,7 +144,7 @@ class ExportPoses(Command):
     """Time that the estimation took [s]; -1 if it is not known."""
 
     def run(self) -> dict[str, Any]:
-        """Export; the result tells how many poses there are."""
+        """Export; the result has the number of poses."""
         from osfcore.contrib.bop import bop_results
         from osfcore.io.files import write_atomically
         from osfcore.io.observation_file import read_observation
@@ -176,7 +176,7 @@ class Import(DataCommand):
     scene: tyro.conf.Positional[Path]
     """Folder of the scene: scene_camera.json, scene_gt.json, rgb, mask_visib."""
     out: Path
-    """Folder to write; must be new or empty. poses.json in it tells the annotated poses in the world."""
+    """Folder to write; must be new or empty. poses.json in it has the annotated poses in the world."""
     images: tuple[int, ...] | None = None
     """Numbers of the images; by default all, or 32 spread over them."""
     names: tuple[str, ...] | None = None
@@ -189,7 +189,7 @@ class Import(DataCommand):
     """Folder with models_info.json, where the models are not those of BOP's YCB-V, which are centred."""
 
     def run(self) -> dict[str, Any]:
-        """Import; the result tells images and objects, and which objects were left out."""
+        """Import; the result lists images, objects, and objects left out."""
         from osfcore.contrib.bop import BopChoice, read_bop_scene
         from osfcore.io.files import folder_at_once, write_json
         from osfcore.io.observation_file import write_observation
@@ -233,7 +233,7 @@ class Check(Command):
     observation with axes, workspace and masks; for a scene of BOP with masks and the annotated objects' axes."""
 
     def run(self) -> dict[str, Any]:
-        """Check; the result tells what it is and how much is in it."""
+        """Check; the result has the kind of file and how much is in it."""
         from osfcore.inspection.check import check_overlay_place, check_path, draw_overlay
 
         if self.overlay is not None:
@@ -244,7 +244,7 @@ class Check(Command):
             report = check_path(self.path)
         except CorruptFile:
             if self.overlay is not None:
-                # What contradicts itself is best seen; what cannot even be drawn was told already.
+                # What contradicts itself is best seen; what cannot even be drawn is in the error.
                 with contextlib.suppress(OsfError):
                     draw_overlay(self.path, self.overlay)
                     self.say(f"{self.overlay} shows how cameras, light and silhouettes were understood.")

@@ -83,29 +83,32 @@ def _parsed(arguments: list[str]) -> Command:
 
     import tyro
 
+    if os.environ.get("NO_COLOR"):
+        tyro._experimental_options["ansi_codes"] = False
     if arguments and arguments[0] in COMMANDS:
         place, description = COMMANDS[arguments[0]]
         module, _, name = place.partition(":")
         kind = getattr(import_module(f"app.cli.{module}"), name)
         return tyro.cli(kind, prog=f"osf {arguments[0]}", args=arguments[1:], description=description)
-    kinds: list[Any] = [
+    kinds = [
         Annotated[make_dataclass(name, ()), tyro.conf.subcommand(name, description=description)]
         for name, (_, description) in COMMANDS.items()
     ]
     description = "Rearrange real objects from a photo. 'osf --version' prints the version."
-    tyro.cli(Union[tuple(kinds)], prog="osf", args=arguments, description=description)  # noqa: UP007
+    choice: Any = Union[tuple(kinds)]  # noqa: UP007
+    tyro.cli(choice, prog="osf", args=arguments, description=description)
     raise AssertionError("the command line lists its commands or refuses the call")
 
 
 def _explained(error: ValueError | ModuleNotFoundError) -> int:
     """Print what was wrong with the call (2), or what failed (1); raise anew what is no error of ours."""
-    from osfcore.errors import OsfError
+    from osfcore.errors import InvalidInput, OsfError, UnknownName
     from osfcore.extras import told_of
 
     explained = told_of(error, "This command") if isinstance(error, ModuleNotFoundError) else error
     if not isinstance(explained, OsfError):
         raise error
-    return _refuse(str(explained), 1)
+    return _refuse(str(explained), 2 if isinstance(explained, InvalidInput | UnknownName) else 1)
 
 
 def _refuse(sentence: str, code: int) -> int:
@@ -119,7 +122,8 @@ def _refuse(sentence: str, code: int) -> int:
 def _drop_output() -> None:
     """Let go of standard output if it cannot be written, so that the interpreter does not try again as it ends."""
     try:
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

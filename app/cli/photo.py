@@ -26,7 +26,7 @@ _FORM = "[PHOTO:]NAME:LEFT,TOP,RIGHT,BOTTOM, such as 025_mug:120,80,260,210"
 
 @dataclass(frozen=True)
 class PhotoBoard(Command):
-    """Write the calibration board, an A4 page; laid on the table it tells where the camera was."""
+    """Write the calibration board, an A4 page; laid on the table it gives the place of the camera."""
 
     out: Path = Path("board.pdf")
     """PDF to write."""
@@ -45,14 +45,14 @@ class PhotoBoard(Command):
 
 @dataclass(frozen=True)
 class PhotoCalibrate(Command):
-    """Calibrate a camera from several photos of the board, and tell the error to expect on the table."""
+    """Calibrate a camera from several photos of the board, and estimate the error to expect on the table."""
 
     photo: tyro.conf.Positional[tuple[Path, ...]]
     """JPEG, PNG or HEIC: three or more by one camera with one zoom, of the board tilted by 30 to 45 degrees."""
     out: Path = Path("camera.json")
     """JSON to write."""
     table: Path | None = None
-    """Photo of the board lying on the table, by the camera in the place where it stays; tells where it stands."""
+    """Photo of the board lying on the table, by the camera in the place where it stays; gives that place."""
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Where the board's centre lies then: x and y in metres, and by how many degrees it is turned to the left."""
 
@@ -110,7 +110,7 @@ class PhotoEstimate(DataCommand):
     pose_frame: Literal["bop", "ycb_video", "google_16k"] | None = None
     """Origin of objects: box's centre, YCB-Video's models, or YCB's meshes; by default what such files usually have."""
     focal: float | None = None
-    """Focal length in pixels; by default what the board or the camera tells."""
+    """Focal length in pixels; by default that of the board or the camera."""
     camera: Path | None = None
     """What 'osf photo calibrate' has written about the camera that took the photos."""
     images: Path | None = None

@@ -38,7 +38,7 @@ class RobotCheck(Command):
     """Folder for overlay.png, with the axes drawn into all pictures, and a picture of each camera, CAMERA.png."""
 
     def run(self) -> dict[str, Any]:
-        """Look some times; the result tells cameras, limits and how long a look takes."""
+        """Look some times; the result has cameras, limits and how long a look takes."""
         from app.episodes.robot import doubts_about
         from osfcore.contrib.robots.connect import connect
         from osfcore.io.output_paths import check_place

@@ -61,7 +61,7 @@ class Serve(DataCommand):
 
         listener = bound_socket(self.host, self.port)
         with closing(listener):
-            check_data_dir(self.data_dir)  # tells now, in one sentence, if it cannot be used
+            check_data_dir(self.data_dir)  # refused now, in one sentence, if it cannot be used
             url = _url(self.host, listener.getsockname()[1])
             settings, login = _settings(self)
             start_log(self.data_dir)
@@ -103,7 +103,7 @@ def bound_socket(host: str, port: int) -> socket.socket:
 def _settings(serve: Serve) -> tuple[Settings, str]:
     """Settings from options and environment, and what an address needs to let one in.
 
-    Whoever lets other machines in has a token, if need be a new one, which is told with the address.
+    Whoever lets other machines in has a token, if need be a new one, which is shown with the address.
     """
     from pydantic import SecretStr, ValidationError
 
@@ -126,9 +126,9 @@ def _settings(serve: Serve) -> tuple[Settings, str]:
 
 
 def _robot(serve: Serve) -> dict[str, Any]:
-    """What was said of a robot; the environment tells what was not."""
-    told = {"robot": serve.robot, "robot_box": serve.box, "robot_top_speed_m_s": serve.top_speed}
-    return {name: value for name, value in told.items() if value is not None}
+    """What was said of a robot; the environment has the rest."""
+    given = {"robot": serve.robot, "robot_box": serve.box, "robot_top_speed_m_s": serve.top_speed}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def is_loopback(host: str) -> bool:
@@ -140,7 +140,7 @@ def is_loopback(host: str) -> bool:
 
 
 def _server(settings: Settings, url: str) -> uvicorn.Server:
-    """A server that tells its address once it is ready, and ends what keeps requests before it waits for them."""
+    """A server that prints its address once it is ready, and ends what keeps requests before it waits for them."""
     import uvicorn
 
     from app.api.app_factory import create_app
@@ -152,7 +152,7 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets)
             if self.started:
-                _tell_ready(app, url)
+                _print_address(app, url)
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             services = getattr(app.state, "services", None)
@@ -177,7 +177,7 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
     )
 
 
-def _tell_ready(app: FastAPI, url: str) -> None:
+def _print_address(app: FastAPI, url: str) -> None:
     if not app.state.services.objects.names():
         print(
             "There are no objects on this machine yet; fetch them on the page or with 'osf assets fetch'.",

@@ -56,7 +56,7 @@ class TrainFieldCommand(Command):
     """Address of a Dask scheduler whose workers train instead; they need the same image sets at the same place."""
 
     def run(self) -> dict[str, Any]:
-        """Train with a progress bar; the result tells PSNR [dB] on the test images, size and time."""
+        """Train with a progress bar; the result has PSNR [dB] on the test images, size and time."""
         places = self._places()
         outs = [out for _, out in places]
         settings, train = self._paper(places) if self.method == "paper" else self._ours(places)

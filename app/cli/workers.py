@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import wait
+from multiprocessing.context import SpawnContext, SpawnProcess
 
 from osfcore.errors import InvalidInput, OsfError, WorkerDied
 
@@ -42,6 +43,10 @@ def worker_pool(
     executor = _processes(workers) if workers > 1 else None
     try:
         yield executor
+    except KeyboardInterrupt:  # a piece of work may take minutes
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
     finally:
         if executor is not None:
             executor.shutdown(wait=True, cancel_futures=True)
@@ -73,10 +78,24 @@ def _cluster(address: str, answers_within_s: float) -> Iterator[Executor]:
             raise WorkerDied("sharing the work of the cluster") from error
 
 
+class _Worker(SpawnProcess):
+    """A worker that begins with Ctrl-C held back: until `_end_with_parent` has run, its answer would be a traceback."""
+
+    def start(self) -> None:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Workers(SpawnContext):
+    Process = _Worker
+
+
 def _processes(workers: int) -> Executor | None:
     try:
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent)
+        return ProcessPoolExecutor(workers, mp_context=_Workers(), initializer=_end_with_parent)
     except OSError:  # no shared memory, as in some sandboxes: slower, but it works
         return None
 
@@ -84,6 +103,7 @@ def _processes(workers: int) -> Executor | None:
 def _end_with_parent() -> None:
     """Let Ctrl-C or the parent's death end a worker at once and silently: what it writes is whole or not there."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=_leave_after, args=(parent.sentinel,), daemon=True).start()

@@ -137,22 +137,22 @@ def test_a_scene_of_bop_goes_in_and_its_poses_come_out(rendered, tmp_path, capsy
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("code", "arguments", "sentence"),
     [
-        (("export", "scene", "--scene", "none.json", "--out", "a.glb"), "none.json cannot be used"),
-        (("export", "field", "009_gelatin_box", "--out", "a.obj"), "a path that ends in .glb or .usdz or .usdc"),
-        (("export", "scene", "--scene", "none.json", "--out", "a.usdc"), "a path that ends in .glb or .usdz"),
-        (("export", "field", "spoon", "--out", "a.glb"), "There is no field named 'spoon'"),
-        (("export", "splats", "009_gelatin_box", "--out", "a.glb"), "must be a path that ends in .ply"),
-        (("export", "splats", "009_gelatin_box", "--out", "a.ply", "--light", "0", "0", "-1"), "light elevation"),
-        (("import", "bop", "none", "--out", "a"), "scene_camera.json cannot be used"),
-        (("import", "bop", "none", "--out", "."), "must be new or empty"),
+        (1, ("export", "scene", "--scene", "none.json", "--out", "a.glb"), "none.json cannot be used"),
+        (2, ("export", "field", "009_gelatin_box", "--out", "a.obj"), "a path that ends in .glb or .usdz or .usdc"),
+        (2, ("export", "scene", "--scene", "none.json", "--out", "a.usdc"), "a path that ends in .glb or .usdz"),
+        (2, ("export", "field", "spoon", "--out", "a.glb"), "There is no field named 'spoon'"),
+        (2, ("export", "splats", "009_gelatin_box", "--out", "a.glb"), "must be a path that ends in .ply"),
+        (2, ("export", "splats", "009_gelatin_box", "--out", "a.ply", "--light", "0", "0", "-1"), "light elevation"),
+        (1, ("import", "bop", "none", "--out", "a"), "scene_camera.json cannot be used"),
+        (2, ("import", "bop", "none", "--out", "."), "must be new or empty"),
     ],
 )
-def test_mistakes_are_told_in_words(arguments, sentence, tmp_path, monkeypatch, capsys):
+def test_mistakes_are_told_in_words(code, arguments, sentence, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "something").write_text("")
-    assert main([*arguments]) == 1
+    assert main([*arguments]) == code
     error = capsys.readouterr().err
     assert sentence in error
     assert error.count("\n") == 1

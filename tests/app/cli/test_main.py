@@ -1,5 +1,7 @@
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 from importlib.metadata import version
@@ -80,27 +82,29 @@ def test_json_is_the_last_line_and_keys_are_stable(data_dir):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("code", "arguments", "words"),
     [
-        (("collect", "object", "teapot", "--out", "{tmp}/a"), "no object named 'teapot'"),
-        (("collect", "object", "024_bowl", "--out", "{tmp}/a"), "osf assets fetch"),
-        (("collect", "object", "006_mustard_bottle", "--out", "{tmp}/a", "--size", "2000"), "between 16 and 1024"),
-        (("collect", "pushes", "--out", "{tmp}/a", "--objects", "9"), "between 1 and 8"),
-        (("collect", "pushes", "--out", "/proc/pushes.h5", "--episodes", "1"), "/proc"),
-        (("train", "field", "--data", "{tmp}", "--out", "{tmp}/a.safetensors"), "anno.json"),
-        (("collect", "observation", "--out", "{tmp}/a", "--names", "teapot"), "no object named 'teapot'"),
-        (("estimate", "--observation", "{tmp}", "--out", "{tmp}/a.json"), "no folder with an observation.json"),
-        (("check", "{tmp}/nothing"), "no such file"),
-        (("assets", "fetch", "teapot"), "teapot"),
-        (("assets", "fetch", "--source", "{tmp}/nowhere"), "nowhere"),
-        (("assets", "add", "{tmp}/nothing.obj", "--name", "x", "--mass", "1"), "nothing.obj"),
+        (2, ("collect", "object", "teapot", "--out", "{tmp}/a"), "no object named 'teapot'"),
+        (1, ("collect", "object", "024_bowl", "--out", "{tmp}/a"), "osf assets fetch"),
+        (2, ("collect", "object", "006_mustard_bottle", "--out", "{tmp}/a", "--size", "2000"), "between 16 and 1024"),
+        (2, ("collect", "pushes", "--out", "{tmp}/a", "--objects", "9"), "between 1 and 8"),
+        (1, ("collect", "pushes", "--out", "/proc/pushes.h5", "--episodes", "1"), "/proc"),
+        (1, ("train", "field", "--data", "{tmp}", "--out", "{tmp}/a.safetensors"), "anno.json"),
+        (2, ("collect", "observation", "--out", "{tmp}/a", "--names", "teapot"), "no object named 'teapot'"),
+        (1, ("estimate", "--observation", "{tmp}", "--out", "{tmp}/a.json"), "no folder with an observation.json"),
+        (1, ("check", "{tmp}/nothing"), "no such file"),
+        (2, ("assets", "fetch", "teapot"), "teapot"),
+        (2, ("assets", "fetch", "--source", "{tmp}/nowhere"), "nowhere"),
+        (1, ("assets", "add", "{tmp}/nothing.obj", "--name", "x", "--mass", "1"), "nothing.obj"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_exit_code_1(data_dir, tmp_path, arguments, words):
+def test_failures_exit_with_1_and_mistakes_in_the_call_with_2_in_one_sentence(
+    data_dir, tmp_path, code, arguments, words
+):
     filled = [argument.format(tmp=tmp_path) for argument in arguments]
     data = [] if filled[0] in ("check", "train") else ["--data-dir", str(data_dir)]
     done = osf(*filled, *data)
-    assert done.returncode == 1
+    assert done.returncode == code
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith("osf: ")
     assert words in last
@@ -110,3 +114,88 @@ def test_a_mistake_is_one_sentence_and_exit_code_1(data_dir, tmp_path, arguments
 def test_a_wrong_call_is_exit_code_2():
     assert osf("fly").returncode == 2
     assert osf("collect", "pushes", "--out", "a.h5", "--episodes", "many").returncode == 2
+
+
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_output_that_nobody_reads_is_no_traceback(tmp_path, more):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "app.cli", "assets", "list", "--data-dir", str(tmp_path), *more]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, timeout=120)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_output_onto_a_full_disk_is_one_sentence(tmp_path, more):
+    command = [sys.executable, "-m", "app.cli", "assets", "list", "--data-dir", str(tmp_path), *more]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    assert done.stderr == "osf: No space left on device.\n"
+
+
+INTERRUPTED = """
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == sys.argv[1]:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+from app.cli.main import main
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.parametrize("module", ["tyro", "numpy", "osfcore.objects.catalogue"])
+def test_an_interruption_while_it_starts_is_one_line(tmp_path, module):
+    command = [sys.executable, "-c", INTERRUPTED, module, "assets", "list", "--data-dir", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "osf: interrupted\n")
+
+
+@pytest.mark.slow
+def test_an_interrupted_command_leaves_nothing_half_written(tmp_path):
+    out = tmp_path / "table"
+    command = [sys.executable, "-m", "app.cli", "collect", "table", "--out", str(out), "--images", "2000"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        first = process.stderr.readline()
+        assert "of 2000 of table" in first
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+    assert process.returncode == 130
+    assert rest.splitlines()[-1] == "osf: interrupted"
+    assert "Traceback" not in rest
+    assert list(tmp_path.iterdir()) == []
+
+
+def help_on_a_terminal(**environment: str) -> bytes:
+    """What `osf --help` writes to a terminal."""
+    screen, terminal = os.openpty()
+    env = {**os.environ, "TERM": "xterm-256color", **environment}
+    subprocess.run([sys.executable, "-m", "app.cli", "--help"], stdout=terminal, env=env, check=True, timeout=120)
+    os.close(terminal)
+    text = b""
+    with contextlib.suppress(OSError):  # how the end of a terminal is seen
+        while part := os.read(screen, 65536):
+            text += part
+    os.close(screen)
+    return text
+
+
+def test_colours_can_be_turned_off():
+    assert b"\x1b[" in help_on_a_terminal(NO_COLOR="")
+    assert b"\x1b[" not in help_on_a_terminal(NO_COLOR="1")
+
+
+def test_the_list_of_commands_needs_no_heavy_package():
+    heavy = ("numpy", "torch", "cv2", "pydantic", "rich")
+    code = (
+        "import sys; from app.cli.main import main\n"
+        "try: main(['--help'])\n"
+        f"except SystemExit: print([name for name in {heavy} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stderr == "[]\n"

@@ -44,7 +44,7 @@ def test_the_board_is_written(tmp_path, capsys):
 
 
 def test_the_board_is_a_pdf(tmp_path, capsys):
-    assert main(["photo", "board", "--out", str(tmp_path / "board.png")]) == 1
+    assert main(["photo", "board", "--out", str(tmp_path / "board.png")]) == 2
     assert "a path that ends in .pdf" in capsys.readouterr().err
 
 
@@ -86,10 +86,10 @@ def test_mistakes_are_told_in_one_sentence(photo, tmp_path, capsys, box, sentenc
     assert sentence in refusal(capsys, tmp_path, "--photo", str(photo), "--boxes", box)
 
 
-def refusal(capsys, tmp_path, *call):
-    """What is said of a call that must not write anything."""
+def refusal(capsys, tmp_path, *call, code=2):
+    """What is said of a call that must not write anything: with code 2 of itself, with 1 of files."""
     out = tmp_path / "found.json"
-    assert main(["photo", "estimate", *call, "--out", str(out), "--data-dir", str(tmp_path)]) == 1
+    assert main(["photo", "estimate", *call, "--out", str(out), "--data-dir", str(tmp_path)]) == code
     error = capsys.readouterr().err
     assert len(error.strip().splitlines()) == 1
     assert "Traceback" not in error
@@ -107,7 +107,9 @@ def test_neither_boxes_nor_masks_are_told(photo, tmp_path, capsys):
 def test_a_text_file_is_no_photo(tmp_path, capsys):
     text = tmp_path / "notes.jpg"
     text.write_text("no photo")
-    assert "it is no picture that can be read here" in refusal(capsys, tmp_path, "--photo", str(text), "--boxes", BOX)
+    assert "it is no picture that can be read here" in refusal(
+        capsys, tmp_path, "--photo", str(text), "--boxes", BOX, code=1
+    )
 
 
 def test_no_photo_is_told(tmp_path, capsys):
@@ -115,7 +117,7 @@ def test_no_photo_is_told(tmp_path, capsys):
 
 
 def test_a_photo_that_is_missing_is_told(tmp_path, capsys):
-    assert "none.jpg" in refusal(capsys, tmp_path, "--photo", str(tmp_path / "none.jpg"), "--boxes", BOX)
+    assert "none.jpg" in refusal(capsys, tmp_path, "--photo", str(tmp_path / "none.jpg"), "--boxes", BOX, code=1)
 
 
 @pytest.mark.parametrize("focal", ["3", "1e7", "-600", "nan"])
@@ -137,7 +139,7 @@ def test_files_of_other_programs_that_do_not_fit_are_told(photo, tmp_path, capsy
     poses, masks = tmp_path / "poses.csv", tmp_path / "masks"
     poses.write_text("no poses")
     call = ["--photo", str(photo), "--boxes", BOX, "--poses", str(poses)]
-    assert "pose 1 is not scene_id,im_id" in refusal(capsys, tmp_path, *call)
+    assert "pose 1 is not scene_id,im_id" in refusal(capsys, tmp_path, *call, code=1)
     masks.mkdir()
     call = ["--photo", str(photo), "--masks", str(masks)]
     assert "number of masks of known objects" in refusal(capsys, tmp_path, *call)
@@ -288,8 +290,8 @@ def calibrated(capsys, *call):
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
-def refused(capsys, *call):
-    assert main(["photo", "calibrate", *call]) == 1
+def refused(capsys, *call, code=2):
+    assert main(["photo", "calibrate", *call]) == code
     return capsys.readouterr().err
 
 
@@ -322,7 +324,7 @@ def test_an_object_is_found_by_the_calibrated_camera(photos, tmp_path, capsys):
     assert any("the one that was calibrated" in note for note in result["notes"])
     assert np.abs(np.array(result["camera"]["T_world_camera"]) - T_WORLD_CAMERA.matrix()).max() < 3e-3
     assert np.linalg.norm(np.array(result["objects"][0]["position"]) - pose.position) < 0.01
-    assert main([*call, "--focal", "560", "--out", str(tmp_path / "found.json")]) == 1
+    assert main([*call, "--focal", "560", "--out", str(tmp_path / "found.json")]) == 2
     assert "--camera tells the focal length" in capsys.readouterr().err
 
 
@@ -343,7 +345,7 @@ def test_what_does_not_suffice_is_refused(photos, tmp_path, capsys):
     frontal = [written(tmp_path, f"above{n}.png", above, 10 + n) for n in range(3)]
     assert "do not tell focal length from distance; in the next, " in refused(capsys, *frontal, *out)
     write_png(tmp_path / "wall.png", np.full((480, 640, 3), 120, np.uint8))
-    assert "wall.png cannot be used: " in refused(capsys, *photos[:3], str(tmp_path / "wall.png"), *out)
+    assert "wall.png cannot be used: " in refused(capsys, *photos[:3], str(tmp_path / "wall.png"), *out, code=1)
     assert "a path that ends in .json" in refused(capsys, *photos, "--out", str(tmp_path / "camera.txt"))
     assert "y of the board [m] is 3" in refused(capsys, *photos, "--place", "0", "3", "0", *out)
     assert not (tmp_path / "camera.json").exists()

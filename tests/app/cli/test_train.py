@@ -93,7 +93,7 @@ def test_the_papers_model_is_trained_on_request(toy_pushes, tmp_path, capsys):
     assert result == {"out": str(out), **json.loads(out.with_suffix(".json").read_text())}
     assert (result["iterations"], read_paper_network(out).hidden) == (30, 8)
     assert "--method paper" in result["command"]
-    assert main([*arguments, *quick, "--rate", "0"]) == 1
+    assert main([*arguments, *quick, "--rate", "0"]) == 2
     assert "rate of learning" in capsys.readouterr().err
 
 
@@ -101,7 +101,7 @@ def test_the_papers_model_is_trained_on_request(toy_pushes, tmp_path, capsys):
 def test_what_the_papers_model_has_not_cannot_be_asked_for(toy_pushes, tmp_path, capsys, option):
     out = tmp_path / "paper.safetensors"
     arguments = ["train", "dynamics", "--method", "paper", "--data", str(toy_pushes), "--out", str(out)]
-    assert main([*arguments, *option]) == 1
+    assert main([*arguments, *option]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert option[0] in line
     assert not out.exists()
@@ -122,7 +122,7 @@ def test_pushes_are_learned_from_collected_ones(library, tmp_path, capsys):
     assert result["iterations"] == 32
     assert "held out" in told.err
     assert read_network(out).hidden == 8
-    assert main([*arguments, *quick, "--without", "teapot", "--rate", "0"]) == 1
+    assert main([*arguments, *quick, "--without", "teapot", "--rate", "0"]) == 2
     assert "rate of learning" in capsys.readouterr().err
 
 
@@ -138,7 +138,7 @@ def test_a_rival_is_trained_from_frames(tmp_path, capsys):
     assert "held out" in told.err
     assert main(arguments) == 0
     assert "the last known frame, copied" in capsys.readouterr().out
-    assert main([*arguments, "--rate", "0"]) == 1
+    assert main([*arguments, "--rate", "0"]) == 2
     assert "rate of learning" in capsys.readouterr().err
 
 

@@ -1,5 +1,6 @@
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -56,6 +57,43 @@ def test_workers_end_with_a_killed_parent(tmp_path):
     while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not Path(f"/proc/{worker}").exists()
+
+
+INTERRUPTED = """
+import os, signal, sys, time
+from app.cli.workers import worker_pool
+
+def interrupting():
+    os.kill(os.getppid(), signal.SIGINT)
+    time.sleep(600)
+
+if __name__ == "__mp_main__" and sys.argv[1] == "starting":
+    os.killpg(os.getpgid(0), signal.SIGINT)
+if __name__ == "__main__":
+    try:
+        with worker_pool(2) as pool:
+            pool.submit(interrupting).result()
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+
+
+@pytest.mark.parametrize("when", ["starting", "working"])
+def test_an_interruption_ends_workers_at_once_and_without_a_word(tmp_path, when):
+    """As from a terminal while workers start, or of the command alone while they work."""
+    script = tmp_path / "parent.py"
+    script.write_text(INTERRUPTED)
+    env = {**os.environ, "PYTHONPATH": os.getcwd()}
+    command = [sys.executable, str(script), when]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, env=env
+    ) as process:
+        try:
+            told = process.communicate(timeout=120)
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+    assert (process.returncode, *told) == (0, "interrupted\n", "")
 
 
 @pytest.mark.parametrize("count", [0, -1, 257])
