@@ -92,6 +92,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.settings, app.state.metrics = settings, status.Metrics()
     limit_of = partial(_body_limit, settings)
+    app.add_middleware(events.DepartureMiddleware)
     app.add_middleware(CompressionMiddleware)
     app.add_middleware(HeadMiddleware)
     app.add_middleware(BodyTimeoutMiddleware)

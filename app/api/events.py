@@ -11,10 +11,12 @@ from collections.abc import AsyncIterator
 from functools import partial
 from typing import Annotated, Any, Literal
 
+import anyio
 from fastapi import APIRouter, Depends, Header, HTTPException, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from app.api.dependencies import Services, ServicesDep
 from app.api.goals import DraftOut
@@ -105,6 +107,27 @@ async def _counted(services: ServicesDep) -> AsyncIterator[None]:
 
 
 StreamDep = Annotated[None, Depends(_counted)]
+
+
+class DepartureMiddleware:
+    """Lets the clients of event streams leave whenever they like.
+
+    FastAPI closes the queue between a stream's generator and its answer before it stops what fills the queue, so that
+    most streams that a client leaves would end in an error of the service.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on one request."""
+        if scope["type"] != "http" or not scope["path"].endswith("/events"):
+            await self._app(scope, receive, send)
+            return
+        try:
+            await self._app(scope, receive, send)
+        except* anyio.BrokenResourceError:
+            pass
 
 
 class Mailbox:

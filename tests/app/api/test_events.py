@@ -3,12 +3,15 @@ import base64
 import http.client
 import io
 import json
+from collections.abc import AsyncIterator
 
 import numpy as np
 import pytest
+from fastapi import FastAPI
+from fastapi.sse import EventSourceResponse, ServerSentEvent
 from PIL import Image
 
-from app.api.events import Mailbox
+from app.api.events import DepartureMiddleware, Mailbox
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals.goals import Draft, DraftChanged, GoalsChanged
@@ -202,3 +205,37 @@ def test_a_mailbox_keeps_only_the_latest_scene_and_images():
         assert (mailbox.is_scene_new, mailbox.frames) == (True, None)
 
     asyncio.run(fill())
+
+
+def test_a_client_that_leaves_a_stream_is_no_error():
+    """It leaves while it does not read, so that the stream has more to say than it may."""
+
+    async def leave():
+        is_full, never = asyncio.Event(), asyncio.Event()
+        requests = [{"type": "http.request", "body": b"", "more_body": False}]
+
+        async def receive():
+            if requests:
+                return requests.pop()
+            await is_full.wait()
+            for _ in range(50):  # the stream gets as far as it can
+                await asyncio.sleep(0)
+            return {"type": "http.disconnect"}
+
+        async def send(message):
+            if message["type"] == "http.response.body":
+                is_full.set()
+                await never.wait()
+
+        app = FastAPI()
+
+        @app.get("/events", response_class=EventSourceResponse)
+        async def stream() -> AsyncIterator[ServerSentEvent]:
+            for number in range(100):
+                yield ServerSentEvent(data=number)
+
+        asgi = {"version": "3.0", "spec_version": "2.3"}
+        scope = {"type": "http", "asgi": asgi, "method": "GET", "path": "/events", "query_string": b"", "headers": []}
+        await DepartureMiddleware(app)(scope, receive, send)
+
+    asyncio.run(leave())

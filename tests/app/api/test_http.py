@@ -78,3 +78,30 @@ def test_a_compressed_file_is_known_again_but_no_part_of_it_is_mixed_with_the_pl
     assert service.get("/js/main.js", headers={"If-None-Match": tag}).status_code == 304
     whole = service.get("/js/main.js", headers={"If-Range": tag, "Range": "bytes=0-9"})
     assert whole.status_code == 200
+
+
+BODIED = [
+    (method, path)
+    for path, methods in SCHEMA["paths"].items()
+    for method in methods
+    if method in ("post", "put", "patch") and path != "/api/robot/stop"
+]
+
+
+@pytest.mark.parametrize(("method", "path"), BODIED)
+@pytest.mark.parametrize(
+    ("body", "headers"),
+    [
+        (gzip.compress(b"{}"), {"Content-Encoding": "gzip"}),
+        (gzip.compress(b"{}")[:-9], {"Content-Encoding": "gzip"}),
+        (b"[" * 50_000, {}),
+        (b'{"a":' * 50_000, {}),
+        (b'{"objects": ' + b"[" * 20_000 + b"]" * 20_000 + b"}", {}),
+        (b"\xff\xfe", {}),
+    ],
+    ids=["gzip", "half a gzip", "deep", "deep objects", "deep within", "no text"],
+)
+def test_no_body_is_a_defect_of_the_service(service, method, path, body, headers):
+    address = re.sub(r"\{[^}]*\}", "1", path)
+    answer = service.request(method, address, content=body, headers={"Content-Type": "application/json", **headers})
+    assert 400 <= answer.status_code < 500 or answer.status_code in (204, 503), answer.text
