@@ -98,7 +98,7 @@ def toward_middle(state):
     return replace(state, poses=Pose(state.poses.position + shifts, state.poses.quaternion))
 
 
-def tell_truth(monkeypatch, table, wanted):
+def know_truth(monkeypatch, table, wanted):
     """Let estimators know where everything is, and where it should be: looks then take no time."""
 
     def steps(state, image_model=None):
@@ -111,12 +111,12 @@ def tell_truth(monkeypatch, table, wanted):
     monkeypatch.setattr(closed_loop, "expected_fit", lambda *_: perfect_fit(len(NAMES)))
 
 
-def noted(app, told):
+def noted(app, paths):
     """An app, of which every path that is asked for is noted."""
 
     async def noting(scope, receive, send):
         if scope["type"] == "http":
-            told.append(scope["path"])
+            paths.append(scope["path"])
         await app(scope, receive, send)
 
     return noting

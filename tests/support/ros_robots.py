@@ -56,17 +56,20 @@ class StandIn:
 
     def messages(self):
         """By topic, what is published now."""
-        told, static = {}, [transform("base", "table", T_BASE_TABLE)]
+        published, static = {}, [transform("base", "table", T_BASE_TABLE)]
         for name, camera in self.cameras.items():
-            told[f"/{name}/image_raw/compressed"] = {"format": "jpeg", "data": self.pictures[name]}
-            told[f"/{name}/camera_info"] = {
+            published[f"/{name}/image_raw/compressed"] = {"format": "jpeg", "data": self.pictures[name]}
+            published[f"/{name}/camera_info"] = {
                 "header": {"frame_id": f"{name}_optical"}, "width": camera.width, "height": camera.height,
                 "d": [0.0] * 5, "k": (camera.intrinsics - _HALF_PIXEL).ravel().tolist(),
             }  # fmt: skip
             static.append(transform("base", f"{name}_optical", T_BASE_TABLE @ camera.T_world_camera))
         pusher = Pose(self.pusher, np.array([1.0, 0, 0, 0]))
-        told |= {"/tf_static": {"transforms": static}, "/tf": {"transforms": [transform("/table", "pusher", pusher)]}}
-        return {topic: message for topic, message in (told | self.extra).items() if topic not in self.silent}
+        published |= {
+            "/tf_static": {"transforms": static},
+            "/tf": {"transforms": [transform("/table", "pusher", pusher)]},
+        }
+        return {topic: message for topic, message in (published | self.extra).items() if topic not in self.silent}
 
     def cut(self):
         """Break all connections."""

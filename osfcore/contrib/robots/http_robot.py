@@ -104,7 +104,7 @@ class SentCamera:
         if image.shape[:2] != (self.height, self.width):
             what = f"picture of camera {shown(self.name)} [px]"
             given = f"{image.shape[1]} x {image.shape[0]}"
-            raise InvalidInput(what, given, f"{self.width} x {self.height}, as the robot tells")
+            raise InvalidInput(what, given, f"{self.width} x {self.height}, as the robot says")
         if any(self.distortion):
             K = self.intrinsics - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV's pixel centres are whole
             image = cv2.undistort(image, K, np.array(self.distortion))

@@ -60,7 +60,7 @@ def test_who_comes_during_the_first_look_is_shown_it():
     assert len(seen) == 2
 
 
-def test_why_there_is_no_picture_is_told():
+def test_why_there_is_no_picture_is_said():
     def take():
         raise OsfError("The lens cap is on.")
 

@@ -31,18 +31,18 @@ GREY = 188  # in sRGB, half the radiance
 
 
 class Process:
-    """In place of a job's process: does nothing by itself, and notes what it is told."""
+    """In place of a job's process: does nothing by itself, and notes its orders."""
 
     latest = None
 
     def __init__(self, job, data_dir, folder, on_event):
         self.id, self.clock, self.pid = job.id, JobClock(), None
         self.orders, self.is_cancelled, self.outcome = [], False, None
-        self._tell = on_event
+        self._on_event = on_event
         Process.latest = self
 
-    def tells(self, drives, done=0):
-        self._tell(JobStep(done, 30, "Pushing", {"drives": drives, "doubts": []}))
+    def reports(self, drives, done=0):
+        self._on_event(JobStep(done, 30, "Pushing", {"drives": drives, "doubts": []}))
 
     def order(self, message):
         self.orders.append(message)
@@ -62,9 +62,9 @@ class Process:
 @pytest.fixture(scope="module")
 def robot(library):
     """Address of a robot, and what it was asked."""
-    told = []
-    with contextlib.closing(simulated(library)) as table, serving(noted(example().robot(table), told)) as url:
-        yield url, told
+    asked = []
+    with contextlib.closing(simulated(library)) as table, serving(noted(example().robot(table), asked)) as url:
+        yield url, asked
 
 
 @contextlib.contextmanager
@@ -103,10 +103,10 @@ def begun(client, drives="asked"):
     assert asked.status_code == 202, asked.text
     assert asked.json()["state"] == "looking"
     until(lambda: client.app.state.services.runner.jobs.live("robot")[0].state == "running")
-    Process.latest.tells("asked")
+    Process.latest.reports("asked")
     if drives == "driving":
         assert allow(client, asked.json()["episode"]["id"]).status_code == 200
-        Process.latest.tells("driving")
+        Process.latest.reports("driving")
     assert state(client) == drives
     return asked.json()["episode"]["id"]
 
@@ -119,12 +119,12 @@ def state(client):
     return client.get("/api/robot").json()["state"]
 
 
-def test_it_tells_limits_that_hold_for_both(service, robot):
-    told = service.get("/api/robot").json()
-    assert (told["host"], told["state"], told["episode"]) == (robot[0].removeprefix("http://"), "idle", None)
-    assert told["limits"] == {"box": [-0.35, -0.35, 0.35, 0.35], "top_speed_m_s": 0.05}
-    assert [camera["name"] for camera in told["cameras"]] == ["0", "1", "2", "3"]
-    assert told["masks"] == sorted(NAMES)
+def test_it_has_limits_that_hold_for_both(service, robot):
+    answer = service.get("/api/robot").json()
+    assert (answer["host"], answer["state"], answer["episode"]) == (robot[0].removeprefix("http://"), "idle", None)
+    assert answer["limits"] == {"box": [-0.35, -0.35, 0.35, 0.35], "top_speed_m_s": 0.05}
+    assert [camera["name"] for camera in answer["cameras"]] == ["0", "1", "2", "3"]
+    assert answer["masks"] == sorted(NAMES)
 
 
 def test_a_service_without_a_robot_says_so(monkeypatch, library, tmp_path):
@@ -137,8 +137,8 @@ def test_a_service_without_a_robot_says_so(monkeypatch, library, tmp_path):
 
 def test_a_robot_that_does_not_answer_is_lost(monkeypatch, library, tmp_path):
     with service_with(monkeypatch, library, tmp_path, robot=f"http://127.0.0.1:{free_port()}") as client:
-        told = client.get("/api/robot").json()
-        assert (told["state"], "does not answer" in told["text"]) == ("lost", True)
+        answer = client.get("/api/robot").json()
+        assert (answer["state"], "does not answer" in answer["text"]) == ("lost", True)
         assert client.post("/api/robot/episodes", json={"goal": "x", "names": ["025_mug"]}).status_code == 503
 
 
@@ -185,9 +185,9 @@ def test_a_stop_reaches_the_robot_and_ends_the_episode_however_often(service, ro
     episode = begun(service, drives)
     robot[1].clear()
     for _ in range(3):
-        told = service.post("/api/robot/stop").json()
-        assert told["state"] == "stopped"
-        assert told["text"] == "The robot was stopped: somebody pressed Stop."
+        answer = service.post("/api/robot/stop").json()
+        assert answer["state"] == "stopped"
+        assert answer["text"] == "The robot was stopped: somebody pressed Stop."
     assert "/stop" in robot[1]
     until(lambda: service.get(f"/api/jobs/{episode}").json()["state"] == "cancelled")
     assert allow(service, episode).status_code == 409
@@ -203,19 +203,19 @@ def test_a_stop_reaches_the_robot_and_ends_the_episode_however_often(service, ro
         (lambda client, _: client.app.state.services.robot.close(), "the service was ended"),
     ],
 )
-def test_job_and_report_of_what_was_stopped_tell_how(service, how, words):
+def test_job_and_report_of_what_was_stopped_say_how(service, how, words):
     episode = begun(service)
     assert allow(service, episode, headers=PAGE).status_code == 200
-    Process.latest.tells("driving")
+    Process.latest.reports("driving")
     report = service.app.state.services.runner.jobs.folder(episode) / REPORT_FILE
     write_json(report, {"outcome": None, "text": None, "steps": []})
     how(service, episode)
     until(lambda: service.get(f"/api/jobs/{episode}").json()["state"] == "cancelled")
     result = service.get(f"/api/jobs/{episode}").json()["result"]
-    told = json.loads(report.read_text())
-    assert (result["outcome"], told["outcome"]) == ("stopped", "stopped")
+    answer = json.loads(report.read_text())
+    assert (result["outcome"], answer["outcome"]) == ("stopped", "stopped")
     assert words in result["text"]
-    assert told["text"] == result["text"]
+    assert answer["text"] == result["text"]
 
 
 def test_why_it_was_stopped_is_known_after_the_service_was_started_anew(monkeypatch, library, tmp_path, robot):
@@ -223,8 +223,8 @@ def test_why_it_was_stopped_is_known_after_the_service_was_started_anew(monkeypa
         begun(client, "driving")
         client.post("/api/robot/stop")
     with service_with(monkeypatch, library, tmp_path, robot=robot[0]) as client:
-        told = client.get("/api/robot").json()
-        assert (told["state"], told["text"]) == ("stopped", "The robot was stopped: somebody pressed Stop.")
+        answer = client.get("/api/robot").json()
+        assert (answer["state"], answer["text"]) == ("stopped", "The robot was stopped: somebody pressed Stop.")
 
 
 def test_anybody_may_stop_it_while_only_the_driver_may_begin(service, robot):
@@ -243,7 +243,7 @@ def test_a_page_that_falls_silent_stops_the_robot(service, robot, lease_s):
     robot[1].clear()
     allowed_at = time.monotonic()
     assert allow(service, episode, headers=PAGE).status_code == 200
-    Process.latest.tells("driving")
+    Process.latest.reports("driving")
     while time.monotonic() < allowed_at + 1.2 * lease_s:
         service.post("/api/robot/presence", headers=PAGE)
         time.sleep(0.1)
@@ -275,10 +275,10 @@ def test_programs_are_not_watched(service):
 
 
 @pytest.mark.parametrize(("outcome", "then"), [({"drives": "over", "text": "Done."}, "idle"), (None, "lost")])
-def test_however_an_episode_ends_the_robot_is_told_to_stop(service, robot, outcome, then):
+def test_however_an_episode_ends_the_robot_is_stopped(service, robot, outcome, then):
     begun(service, "driving")
     if outcome is None:
-        Process.latest.tells("lost")
+        Process.latest.reports("lost")
     robot[1].clear()
     Process.latest.outcome = outcome or ConnectionLost("http://robot", "no route")
     until(lambda: state(service) == then)
@@ -340,8 +340,8 @@ def test_cameras_are_shown_as_they_see_it_and_asked_at_most_once_a_second(servic
     assert service.get("/api/robot/cameras/0.jpg").status_code == 200
     asked = robot[1].count("/images/0")
     assert asked == 1
-    (first, *_) = told = service.get("/api/robot/cameras").json()
-    assert [(camera["name"], camera["width"], camera["height"]) for camera in told] == [
+    (first, *_) = seen = service.get("/api/robot/cameras").json()
+    assert [(camera["name"], camera["width"], camera["height"]) for camera in seen] == [
         (str(n), 64, 64) for n in range(4)
     ]
     assert first["age_s"] < 30
@@ -368,7 +368,7 @@ def test_an_episode_that_looks_or_moves_is_not_held_up_by_who_watches(service, r
     assert robot[1] == []
 
 
-def test_before_the_first_look_there_is_no_picture_and_that_is_told(service, robot):
+def test_before_the_first_look_there_is_no_picture_and_that_is_said(service, robot):
     begun(service, "driving")
     assert set(cameras(service).values()) == {None}
     answer = service.get("/api/robot/cameras/0.jpg")
@@ -382,7 +382,7 @@ def test_whoever_is_asked_for_permission_sees_the_table_as_it_is_now(service):
     assert not np.all(shown(service) == GREY)
 
 
-def test_a_camera_that_there_is_not_is_told(service):
+def test_a_camera_that_there_is_not_is_said(service):
     answer = service.get("/api/robot/cameras/above.jpg")
     assert (answer.status_code, "no camera of the robot named 'above'" in answer.json()["detail"]) == (404, True)
 

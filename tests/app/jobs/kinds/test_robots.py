@@ -11,7 +11,7 @@ from app.jobs.worker import run_job
 from osfcore.contrib.robots.connect import connect
 from osfcore.contrib.robots.robot import ConnectionLost, RobotRefused, RobotStopped
 from osfcore.io.image_file import write_png
-from tests.support.robots import NAMES, example, serving, simulated, tell_truth, toward_middle, until
+from tests.support.robots import NAMES, example, know_truth, serving, simulated, toward_middle, until
 
 
 class Driven:
@@ -36,7 +36,7 @@ class Driven:
         except Exception as error:
             self.outcome = error
 
-    def told(self, drives):
+    def wait_for(self, drives):
         """Wait until it says so."""
         until(lambda: self.outcome is not None or any(step.result["drives"] == drives for step in self.steps), 120)
         assert self.steps[-1].result["drives"] == drives, self.outcome
@@ -49,13 +49,13 @@ class Driven:
 @pytest.fixture
 def robot(library, monkeypatch):
     with contextlib.closing(simulated(library)) as table, serving(example().robot(table)) as url:
-        tell_truth(monkeypatch, table, toward_middle(table.truth()))
+        know_truth(monkeypatch, table, toward_middle(table.truth()))
         yield url, table
 
 
 def test_it_waits_for_permission_and_then_does_its_steps(robot, tmp_path):
     before, job = robot[1].truth().pusher, Driven(robot[0], tmp_path)
-    job.told("asked")
+    job.wait_for("asked")
     np.testing.assert_array_equal(robot[1].truth().pusher, before)
     job.control.take(ChangeJob({"allowed": True}))
     ended = job.end()
@@ -71,7 +71,7 @@ def test_it_waits_for_permission_and_then_does_its_steps(robot, tmp_path):
 @pytest.mark.parametrize("change", [{"settings": {"steps": 3}}, {"allowed": False}, {"allowed": "no"}])
 def test_no_other_change_of_parameters_is_a_permission(robot, tmp_path, change):
     before, job = robot[1].truth().pusher, Driven(robot[0], tmp_path)
-    job.told("asked")
+    job.wait_for("asked")
     job.control.take(ChangeJob(change))
     until(lambda: job.outcome is not None or [step.result["drives"] for step in job.steps][-2:] != ["looking", "asked"])
     assert job.steps[-1].result["drives"] == "asked"
@@ -82,7 +82,7 @@ def test_no_other_change_of_parameters_is_a_permission(robot, tmp_path, change):
 
 def test_cancelled_while_it_asks_nothing_has_moved(robot, tmp_path):
     before, job = robot[1].truth().pusher, Driven(robot[0], tmp_path)
-    job.told("asked")
+    job.wait_for("asked")
     job.control.take(CancelJob())
     assert isinstance(job.end(), JobCancelled)
     np.testing.assert_array_equal(robot[1].truth().pusher, before)
@@ -90,7 +90,7 @@ def test_cancelled_while_it_asks_nothing_has_moved(robot, tmp_path):
 
 def test_a_cancel_stops_the_robot_in_the_middle_of_a_motion(robot, tmp_path):
     before, job = robot[1].truth().pusher, Driven(robot[0], tmp_path, top_speed_m_s=0.005)  # one action takes seconds
-    job.told("asked")
+    job.wait_for("asked")
     job.control.take(ChangeJob({"allowed": True}))
     until(lambda: np.any(robot[1].truth().pusher != before), 120)
     job.control.take(CancelJob())
@@ -100,12 +100,12 @@ def test_a_cancel_stops_the_robot_in_the_middle_of_a_motion(robot, tmp_path):
     assert job.steps[-1].done == 0
 
 
-def test_a_robot_that_is_lost_is_told_before_the_job_fails(library, tmp_path, monkeypatch):
+def test_a_robot_that_is_lost_is_announced_before_the_job_fails(library, tmp_path, monkeypatch):
     with contextlib.closing(simulated(library)) as table:
-        tell_truth(monkeypatch, table, toward_middle(table.truth()))
+        know_truth(monkeypatch, table, toward_middle(table.truth()))
         with serving(example().robot(table)) as url:
             job = Driven(url, tmp_path)
-            job.told("asked")
+            job.wait_for("asked")
         job.control.take(ChangeJob({"allowed": True}))
         assert isinstance(job.end(), ConnectionLost)
         assert job.steps[-1].result["drives"] == "lost"

@@ -30,7 +30,7 @@ class Marble:
 
     def __init__(self, place=(0.0, 0.0), shares=(), fails=(), *, blind=False):
         self.place, self.shares, self.fails, self.blind = np.array(place, float), list(shares), dict(fails), blind
-        self.way, self.velocities, self.told = [self.place.copy()], [], []
+        self.way, self.velocities, self.calls = [self.place.copy()], [], []
 
     def reset(self, seed):
         return self.observe()
@@ -48,14 +48,14 @@ class Marble:
         self.way.append(self.place.copy())
 
     def start(self):
-        self.told.append("start")
+        self.calls.append("start")
 
     def stop(self):
-        self.told.append("stop")
+        self.calls.append("stop")
         self._fail("stop")
 
     def close(self):
-        self.told.append("close")
+        self.calls.append("close")
 
     def _fail(self, what):
         if what in self.fails:
@@ -124,7 +124,7 @@ def test_a_pusher_slightly_outside_returns_and_one_far_outside_is_not_moved():
     far = Marble((0.3, 0.0))
     with pytest.raises(InvalidInput, check=about("place of the pusher")):
         guarded(far).act(-RIGHT)
-    assert far.velocities == far.told == []
+    assert far.velocities == far.calls == []
 
 
 def test_a_pusher_that_always_says_the_same_place_is_stopped_before_it_is_asked_to_go_far():
@@ -133,7 +133,7 @@ def test_a_pusher_that_always_says_the_same_place_is_stopped_before_it_is_asked_
         guard = guarded(world)
         with pytest.raises(RobotStopped, check=about("hardly moved")):
             move_and_look(guard, *[-RIGHT] * 10)
-        assert world.told == ["start", "stop"]
+        assert world.calls == ["start", "stop"]
         assert BOX[0] - 1e-9 <= world.place[0] < -0.05
 
 
@@ -160,7 +160,7 @@ def test_a_pusher_that_goes_too_far_or_another_way_is_stopped(share):
     guard.act(-RIGHT)
     with pytest.raises(RobotStopped, check=about("away from where")):
         guard.observe()
-    assert world.told == ["start", "stop"]
+    assert world.calls == ["start", "stop"]
     with pytest.raises(RobotStopped):
         guard.act(RIGHT)
 
@@ -186,7 +186,7 @@ def test_a_controller_that_lags_and_one_that_goes_on_a_little_are_not_stopped():
         world = Marble(shares=[share] * 400)
         guard = guarded(world, SafetyLimits())
         move_and_look(guard, *[RIGHT, RIGHT, -RIGHT, -RIGHT] * 10)
-        assert world.told == ["start"]
+        assert world.calls == ["start"]
 
 
 def test_a_pusher_that_is_moved_by_hand_before_it_is_started_is_where_it_is_seen():
@@ -196,7 +196,7 @@ def test_a_pusher_that_is_moved_by_hand_before_it_is_started_is_where_it_is_seen
     guard.observe()
     guard.act(RIGHT)
     guard.observe()
-    assert world.told == ["start"]
+    assert world.calls == ["start"]
 
 
 def test_nothing_moves_before_its_place_is_known_or_for_what_is_no_action():
@@ -206,22 +206,22 @@ def test_nothing_moves_before_its_place_is_known_or_for_what_is_no_action():
     guard = guarded(world)
     with pytest.raises(InvalidInput, check=about("action")):
         guard.act(np.array([0.5, 0.0, 0.0]))
-    assert world.told == []
+    assert world.calls == []
     guard.check()
 
 
 def test_it_asks_once_before_the_first_motion_and_nothing_moves_if_nobody_allows_it():
     asked, world = [], Marble()
-    guard = guarded(world, permit=lambda: not asked.append(world.told.copy()))
+    guard = guarded(world, permit=lambda: not asked.append(world.calls.copy()))
     guard.act(RIGHT)
     guard.act(-RIGHT)
     assert asked == [[]]
-    assert world.told == ["start"]
+    assert world.calls == ["start"]
     world = Marble()
     with pytest.raises(RobotStopped, check=about("nobody allowed it")):
         guarded(world, permit=lambda: False).act(RIGHT)
     assert world.velocities == []
-    assert "start" not in world.told
+    assert "start" not in world.calls
 
 
 @pytest.mark.parametrize("error", [ConnectionLost("http://robot", "cut"), RuntimeError("broken")])
@@ -236,21 +236,21 @@ def test_after_a_stop_every_action_is_refused_with_the_first_reason_and_closing_
         with pytest.raises(RobotStopped, check=about("a key was pressed")):
             guard.act(RIGHT)
     guard.close()
-    assert world.told == ["start", "stop", "stop", "stop", "close"]
+    assert world.calls == ["start", "stop", "stop", "stop", "close"]
 
 
 def test_a_stop_from_another_thread_ends_a_motion_that_is_under_way():
-    begun, told = threading.Event(), threading.Event()
+    begun, stopped = threading.Event(), threading.Event()
 
     class Slow(Marble):
         def act(self, action):
             super().act(action)
             begun.set()
-            assert told.wait(10)
+            assert stopped.wait(10)
 
         def stop(self):
             super().stop()
-            told.set()
+            stopped.set()
 
     world = Slow()
     guard = guarded(world, SafetyLimits(top_speed_m_s=0.1))
@@ -271,7 +271,7 @@ def test_whatever_goes_wrong_stops_the_robot(what, error):
     world.fails[what] = error
     with pytest.raises(type(error)):
         guard.act(RIGHT) if what == "act" else guard.observe()
-    assert world.told == ["start", "stop"]
+    assert world.calls == ["start", "stop"]
     with pytest.raises(RobotStopped):
         guard.act(RIGHT)
 

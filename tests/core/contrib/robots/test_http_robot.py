@@ -249,26 +249,26 @@ def test_damaged_pictures_are_refused(odd, odd_robot):
 
 
 def test_closing_lets_a_stop_from_another_thread_arrive(odd):
-    told, may_answer = [], threading.Event()
+    log, may_answer = [], threading.Event()
     app = odd[1].app()
     odd[1].robot = odd[1].good
 
     @app.post("/stop")
     def stop():
-        told.append("begun")
+        log.append("begun")
         assert may_answer.wait(20)
-        told.append("stopped")
+        log.append("stopped")
 
     with serving(app) as url:
         robot = HttpRobot(url, NAMES, timeout_s=30.0)
         other = threading.Thread(target=robot.stop)
         other.start()
-        until(lambda: told == ["begun"])
+        until(lambda: log == ["begun"])
         closing = threading.Thread(target=robot.close)
         closing.start()
         may_answer.set()
         closing.join()
-        assert told == ["begun", "stopped"]
+        assert log == ["begun", "stopped"]
         other.join()
 
 
