@@ -1,5 +1,16 @@
 """Episodes as MCAP files, for Foxglove, Lichtblick, and whatever else reads MCAP.
 
+Topics, on a clock of simulated time that begins at 0, 0.2 s an action:
+
+    /tf                FrameTransforms    from `world` (z up, [m]) to NAME (the truth), `estimate/NAME`, `goal/NAME`,
+                                          `pusher`, `light`, and `goal_camera` (x right, y down, z forward)
+    /scene             SceneUpdate        table, objects with their colours, pusher and lamp, each in its frame
+    /estimate, /goal   SceneUpdate        the objects where they are thought to be, and where they should be
+    /plan              SceneUpdate        the pusher's way in the best future of each plan
+    /goal/image        CompressedImage    the goal, and /goal/calibration (CameraCalibration) its camera
+    /frames            CompressedImage    goal, table and estimate side by side, one for each round
+    /log               Log                what was noticed, and how it ended
+
 Foxglove's quaternions are (x, y, z, w), its colours RGBA in [0, 1].
 
 Raises:

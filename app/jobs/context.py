@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from app.processes.client import ProcessUnavailable
 from app.processes.messages.scene_messages import Act, ObserveScene, TakeView
-from app.processes.process_client import ProcessUnavailable
-from app.processes.process_server import Answer
+from app.processes.server import Answer
 from osfcore.errors import OsfError
 from osfcore.objects.asset_library import AssetLibrary
 

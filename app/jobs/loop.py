@@ -20,7 +20,7 @@ from app.jobs.kinds import KINDS
 from app.jobs.process import JobDied, JobProcess, JobStopped, Outcome
 from app.jobs.table import JobTable
 from app.processes.messages.scene_messages import Command
-from app.processes.process_server import Answer, InternalError
+from app.processes.server import Answer, InternalError
 from app.storage.database import now_utc
 from osfcore.errors import OsfError, UnknownName
 from osfcore.io.files import sync_tree

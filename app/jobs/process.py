@@ -15,7 +15,7 @@ from app.jobs.context import CancelJob, JobCancelled, RunJob
 from app.jobs.job import Job
 from app.jobs.kinds import KINDS
 from app.jobs.worker import job_main
-from app.processes.process_client import ProcessClient, ProcessFrozen, ProcessUnavailable
+from app.processes.client import ProcessClient, ProcessFrozen, ProcessUnavailable
 from osfcore.errors import OsfError
 
 WHO = "job"

@@ -11,7 +11,7 @@ from typing import Any
 from app.jobs.context import JobCancelled, JobContext, JobControl, JobRests, JobStep, RunJob
 from app.jobs.kinds import KINDS
 from app.processes.child_process import end_own_group, import_quietly, own_group
-from app.processes.process_server import ProcessServer
+from app.processes.server import ProcessServer
 from osfcore.errors import OsfError
 
 STEP_INTERVAL_S = 0.1

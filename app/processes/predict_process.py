@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from app.processes.messages.neural_messages import Order, Predicted, PredictPushes
-from app.processes.process_server import IsOvertaken, ProcessServer
+from app.processes.server import IsOvertaken, ProcessServer
 from osfcore.errors import OsfError
 from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
 from osfcore.paper.method import Method

@@ -23,8 +23,8 @@ from app.processes.messages.neural_messages import (
     DrawView,
     Order,
 )
-from app.processes.process_server import IsOvertaken, ProcessServer
 from app.processes.render_cameras import bands
+from app.processes.server import IsOvertaken, ProcessServer
 from osfcore.fields.field_library import TABLE_NAME, FieldLibrary
 from osfcore.io.image_file import encode_png, to_uint8
 

@@ -9,9 +9,9 @@ from concurrent.futures import Future
 import numpy as np
 from jaxtyping import Float
 
+from app.processes.client import ProcessClient
 from app.processes.messages.neural_messages import NeuralAnswer, PredictPushes
 from app.processes.messages.scene_messages import SceneRecord
-from app.processes.process_client import ProcessClient
 from app.services.fields import MissingFields
 from app.services.runner import Runner
 from osfcore.errors import InvalidInput, OsfError

@@ -165,7 +165,7 @@ class Runner(Scenes):
         with self._ordering:
             if kind == "train_field":
                 self._check_training(params)
-            known = self.library.info if fetches else self._check_object
+            known = self.library.info if fetches else self.library.check
             KINDS[kind].check(params, known, len(self.library.names()))
             return self.jobs.submit(kind, params)
 
@@ -283,7 +283,7 @@ class Runner(Scenes):
         if name in RESERVED:
             raise InvalidInput("object name", repr(name), "another one; this one is taken")
         if source["mesh"] is not None:
-            self._check_object(source["mesh"])
+            self.library.check(source["mesh"])
         else:
             self.sets.get(source["set"])
         for job in self.jobs.live("train_field"):

@@ -17,9 +17,9 @@ from jaxtyping import UInt8
 from pydantic import FiniteFloat
 
 from app.processes.child_process import limit_memory
-from app.processes.pictures.photo_process import PhotoRefused
-from app.processes.process_client import ProcessClient, ProcessHangs
-from app.processes.process_server import ProcessServer
+from app.processes.client import ProcessClient, ProcessHangs
+from app.processes.photo_process import PhotoRefused
+from app.processes.server import ProcessServer
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.geometry.cameras import Camera
 from osfcore.photo.read_photograph import MIN_SIDE, read_photograph

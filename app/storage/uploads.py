@@ -15,8 +15,8 @@ from typing import Generic, TypeVar
 from starlette.concurrency import run_in_threadpool
 
 from app.processes.child_process import limit_memory, own_group
-from app.processes.process_client import ProcessClient, ProcessHangs, ProcessUnavailable
-from app.processes.process_server import ProcessServer
+from app.processes.client import ProcessClient, ProcessHangs, ProcessUnavailable
+from app.processes.server import ProcessServer
 from app.storage.database import CannotStore
 from osfcore.errors import CannotWrite, CorruptFile, OsfError
 from osfcore.io.archives import check_zip

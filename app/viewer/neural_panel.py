@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
+from app.processes.client import ProcessClient
 from app.processes.messages.neural_messages import DrawnView, DrawView, NeuralAnswer
-from app.processes.process_client import ProcessClient
 from app.processes.render_cameras import view_camera
 from app.viewer.drawing import Panel
 from osfcore.errors import OsfError

@@ -17,7 +17,7 @@ from typing import Literal
 import viser
 
 from app.episodes.trajectory import LookFrame, Moment, ReplayClock, Round, Trajectory, read_trajectory
-from app.processes.process_client import ProcessClient
+from app.processes.client import ProcessClient
 from app.viewer.drawing import Panel
 from app.viewer.neural_panel import NeuralPanel
 from app.viewer.nodes.episode_nodes import EpisodeNodes

@@ -17,8 +17,8 @@ from pathlib import Path
 import viser
 
 from app.jobs.job import JobChanged
+from app.processes.client import ProcessClient
 from app.processes.messages.scene_messages import SceneRecord
-from app.processes.process_client import ProcessClient
 from app.services.event_hub import CurrentScene
 from app.services.goals.goals import DraftChanged, Goals
 from app.services.predictions import Predictions

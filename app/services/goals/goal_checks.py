@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from app.processes.client import ProcessClient, ProcessUnavailable
 from app.processes.messages.neural_messages import CheckPhoto
 from app.processes.messages.scene_messages import SceneRecord
-from app.processes.process_client import ProcessClient, ProcessUnavailable
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.goals.goals import Goals, NoTable
 from app.services.runner import Runner

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 
+from app.processes.client import ProcessClient, ProcessHangs
 from app.processes.messages.photo_messages import PhotoAnswer, PhotoOrder
-from app.processes.pictures.photo_process import PhotoRefused, photo_main
-from app.processes.process_client import ProcessClient, ProcessHangs
+from app.processes.photo_process import PhotoRefused, photo_main
 
 _PATIENCE_S = 30.0  # sound photos take three, and a busy machine some to start the process
 

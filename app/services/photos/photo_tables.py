@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from app.processes.client import ProcessClient
 from app.processes.messages.neural_messages import DrawPhoto
 from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
-from app.processes.process_client import ProcessClient
 from app.services.goals.goals import Goals
 from app.services.photos.table_photos import TablePhotos
 from app.services.runner import Runner

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from app.api.dependencies import Lane, ObjectCatalogue
-from app.processes.process_client import ProcessBusy
+from app.processes.client import ProcessBusy
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import CATALOGUE
 from tests.app.conftest import until

@@ -13,7 +13,7 @@ from app.jobs.loop import INTERRUPTED_NOTE, RESUMES_NOTE
 from app.jobs.process import JobClock, JobDied, JobStopped
 from app.jobs.registry import Jobs, QueueFull, WrongJobState
 from app.processes.messages.scene_messages import TakeImage
-from app.processes.process_server import InternalError
+from app.processes.server import InternalError
 from app.storage.database import CannotStore, Store
 from app.storage.field_files import workshop
 from osfcore.errors import UnknownName

@@ -25,10 +25,9 @@ from app.jobs.loop import after
 from app.jobs.process import JobStopped
 from app.jobs.worker import job_main, run_job
 from app.processes.child_process import launch
+from app.processes.client import ProcessClient, ProcessUnavailable
 from app.processes.messages.scene_messages import TakeImage
-from app.processes.process_client import ProcessClient, ProcessUnavailable
-from app.processes.process_server import Answer, InternalError, Ready, child_main
-from app.processes.request_queue import Request
+from app.processes.server import Answer, InternalError, Ready, Request, child_main
 from osfcore.errors import OsfError, UnknownName
 from tests.app.conftest import until
 from tests.support.errors import about

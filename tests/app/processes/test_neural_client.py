@@ -5,11 +5,11 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 
+from app.processes.client import MAX_PENDING, ProcessBusy, ProcessClient, ProcessUnavailable
 from app.processes.messages.neural_messages import DrawnView, DrawView, Predicted, PredictPushes
 from app.processes.predict_process import predictor_main
-from app.processes.process_client import MAX_PENDING, ProcessBusy, ProcessClient, ProcessUnavailable
-from app.processes.process_server import InternalError
 from app.processes.render_process import renderer_main
+from app.processes.server import InternalError
 from osfcore.errors import UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.states import SceneState

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from app.processes.process_client import ProcessClient, ProcessFrozen, ProcessHangs, ProcessUnavailable
+from app.processes.client import ProcessClient, ProcessFrozen, ProcessHangs, ProcessUnavailable
 from tests.app.conftest import until
 
 LARGE = bytes(1 << 20)  # more than a pipe holds

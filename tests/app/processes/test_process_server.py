@@ -3,8 +3,8 @@ import warnings
 
 import pytest
 
-from app.processes.process_client import ProcessClient
-from app.processes.process_server import InternalError
+from app.processes.client import ProcessClient
+from app.processes.server import InternalError
 
 
 def grumbling_main(server):
@@ -27,7 +27,7 @@ def test_what_a_child_logs_is_logged_by_the_service(caplog):
     assert told[0] == ("osf.child", "WARNING", "words of a child")
     assert told[1][:2] == ("py.warnings", "WARNING")
     assert "RuntimeWarning: of a library" in told[1][2]
-    assert told[2][:2] == ("app.processes.process_server", "ERROR")
+    assert told[2][:2] == ("app.processes.server", "ERROR")
     assert "could not carry out str" in told[2][2]
     assert "ZeroDivisionError: a defect" in told[2][2]
     assert len(told) == 3

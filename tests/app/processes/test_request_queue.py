@@ -1,7 +1,7 @@
 import threading
 
 from app.processes.messages.neural_messages import CompareView, DrawView
-from app.processes.request_queue import Request, RequestQueue
+from app.processes.server import Request, RequestQueue
 
 
 def draw(number, key, *, is_sharp=False):

@@ -5,8 +5,8 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 
+from app.processes.client import MAX_PENDING, ProcessBusy, ProcessClient, ProcessFrozen, ProcessUnavailable
 from app.processes.messages.scene_messages import Act, AdoptScene, CreateScene, ResetScene, SceneChanged, TakeImage
-from app.processes.process_client import MAX_PENDING, ProcessBusy, ProcessClient, ProcessFrozen, ProcessUnavailable
 from app.processes.sim_process import simulation_main
 from osfcore.errors import OverlappingObjects, UnknownName
 from osfcore.geometry.poses import Pose

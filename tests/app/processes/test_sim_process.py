@@ -26,8 +26,7 @@ from app.processes.messages.scene_messages import (
     TakeView,
     WatchFrames,
 )
-from app.processes.process_server import Answer, ProcessServer, Ready
-from app.processes.request_queue import Request
+from app.processes.server import Answer, ProcessServer, Ready, Request
 from app.processes.sim_process import Simulation
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
 from osfcore.geometry.cameras import goal_camera

@@ -2,8 +2,7 @@ import json
 
 import pytest
 
-from app.episodes.replay_clock import ReplayClock
-from app.episodes.trajectory import read_trajectory
+from app.episodes.trajectory import ReplayClock, read_trajectory
 from app.services.examples.presets import PRESETS
 from app.services.examples.stories import Stories
 from osfcore.control.prepared import prepared_from_json

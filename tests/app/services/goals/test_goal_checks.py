@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.processes.client import ProcessUnavailable
 from app.processes.messages.neural_messages import CheckPhoto
-from app.processes.process_client import ProcessUnavailable
 from app.services.fields import MissingFields
 from app.services.goals.goal_checks import GoalChecks, GoalRefused
 from app.services.goals.goals import NoTable

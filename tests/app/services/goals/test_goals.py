@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from app.processes.client import ProcessUnavailable
 from app.processes.messages.scene_messages import ComposedGoal
-from app.processes.process_client import ProcessUnavailable
-from app.processes.process_server import InternalError
+from app.processes.server import InternalError
 from app.services.event_hub import Hub
 from app.services.goals.goals import (
     GOAL_SIDE,

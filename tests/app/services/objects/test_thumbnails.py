@@ -1,6 +1,6 @@
 import pytest
 
-from app.processes.process_client import ProcessUnavailable
+from app.processes.client import ProcessUnavailable
 from app.services.objects.thumbnails import Thumbnails
 from tests.app.conftest import full_disk
 

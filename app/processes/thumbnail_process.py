@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from app.processes.child_process import limit_memory
-from app.processes.process_server import ProcessServer
+from app.processes.server import ProcessServer
 
 _MEMORY_BYTES = 3 << 30  # an object with the largest texture takes one
 

@@ -23,11 +23,12 @@ from app.processes.messages.photo_messages import (
     ReadPhoto,
     SightBoard,
 )
-from app.processes.process_server import ProcessServer
+from app.processes.server import ProcessServer
 from osfcore.errors import CorruptFile, OsfError
 
 if TYPE_CHECKING:
     from osfcore.photo.read_photograph import RawPhotograph
+
 
 _MEMORY_BYTES = 3 << 29  # sound photos take two thirds of it
 _JPEG_QUALITY = 95

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from app.processes.messages.photo_messages import FindMask, Mark, ReadPhoto, Stroke
-from app.processes.pictures.photo_process import PhotoRefused, carry_out
+from app.processes.photo_process import PhotoRefused, carry_out
 from osfcore.errors import InvalidInput
 from tests.support.errors import about
 

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import itertools
 import logging
 import math
+import pickle
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from pathlib import Path
 from typing import Any, Literal
 
 from app.processes.child_process import end, launch
-from app.processes.outbox import Outbox
-from app.processes.process_server import Alive, Answer, Logged, Overtaken, Ready, child_main
-from app.processes.request_queue import Request
-from app.processes.watchdog import Watchdog
+from app.processes.server import Alive, Answer, Logged, Overtaken, Ready, Request, child_main
 from osfcore.errors import OsfError
 
 Status = Literal["starting", "ready", "restarting"]
@@ -313,3 +314,116 @@ class ProcessClient:
                     self._on_event(message)
                 except Exception:
                     _log.exception("what the %s told could not be used", self._who)
+
+
+# Messages on their way to a child process
+
+
+MAX_WAITING = 1000
+
+
+class Outbox:
+    """A queue before a pipe, and the thread that empties it: whoever sends a message never waits.
+
+    The pipe of a process that does not read (it is stopped, or swamped) is full after some hundred kilobytes. Writing
+    to it then blocks, so a thread of its own writes, and nobody holds a lock meanwhile.
+
+    Args:
+        connection: to write to; may be closed once `stop` has returned.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._waiting: queue.Queue[bytes | None] = queue.Queue(MAX_WAITING)
+        self._is_over = False
+        self._thread = threading.Thread(target=self._write, name="outbox", daemon=True)
+        self._thread.start()
+
+    def put(self, message: object) -> bool:
+        """Send a message when its turn has come; returns False if too many wait already, or the process has gone."""
+        data = pickle.dumps(message)
+        try:
+            self._waiting.put_nowait(data)
+        except queue.Full:
+            return False
+        return not self._is_over
+
+    def stop(self) -> None:
+        """End the thread, once the process has ended, so that writing fails; what waits is dropped."""
+        self._is_over = True
+        with contextlib.suppress(queue.Full):  # then the thread is awake, and sees that it is over
+            self._waiting.put_nowait(None)
+        self._thread.join()
+
+    def _write(self) -> None:
+        try:
+            while (data := self._waiting.get()) is not None and not self._is_over:
+                self._connection.send_bytes(data)
+        except OSError:  # the process has ended, which the listening thread sees as well
+            self._is_over = True
+
+
+# Ending a process that shows no sign of life
+
+
+LOOK_S = 0.25  # between two looks
+STOPPED_S = 1.0  # a process that the system has stopped may be silent
+SILENT_S = 30.0  # any other: compiling and loading on a busy machine keep even a thread of its own from speaking
+_STOPPED = "T"
+
+
+class Watchdog:
+    """Watches one process, in a thread of its own, and ends it if it shows no sign of life.
+
+    Every child sends `Alive` twice a second from a thread of its own. A child that is silent and stopped (SIGSTOP) is
+    frozen; one that is silent for long is, too; one that lives but answers nobody hangs.
+
+    Time is counted in looks, not by the clock: what passes while the service itself is stopped (Ctrl-Z) is no silence.
+
+    Args:
+        pid: of the process.
+        answer_s: how long it may answer nobody while requests wait [s].
+        is_asked: whether requests wait.
+        bark: called once, with whether the process is frozen rather than hanging; ends it.
+    """
+
+    def __init__(
+        self, pid: int, answer_s: Callable[[], float], is_asked: Callable[[], bool], bark: Callable[[bool], None]
+    ) -> None:
+        self._pid, self._answer_s, self._is_asked, self._bark = pid, answer_s, is_asked, bark
+        self._is_over = threading.Event()
+        self._has_spoken = self._has_answered = True
+        self._silent_s = self._waited_s = 0.0
+        threading.Thread(target=self._watch, name=f"watchdog-{pid}", daemon=True).start()
+
+    def spoken(self) -> None:
+        """The process has sent something."""
+        self._has_spoken = True
+
+    def answered(self) -> None:
+        """The process has answered somebody."""
+        self._has_answered = True
+
+    def stop(self) -> None:
+        """Watch no more."""
+        self._is_over.set()
+
+    def _watch(self) -> None:
+        while not self._is_over.wait(LOOK_S):
+            self._silent_s = 0.0 if self._has_spoken else self._silent_s + LOOK_S
+            # Waiting behind others is no sign of hanging, so an answer to anybody counts.
+            self._waited_s = self._waited_s + LOOK_S if self._is_asked() and not self._has_answered else 0.0
+            self._has_spoken = self._has_answered = False
+            is_frozen = self._silent_s >= SILENT_S or (self._silent_s >= STOPPED_S and _is_stopped(self._pid))
+            if is_frozen or self._waited_s > self._answer_s():
+                self._bark(is_frozen)
+                return
+
+
+def _is_stopped(pid: int) -> bool:
+    """Whether the system has stopped a process; False where it does not tell."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="latin-1")
+    except OSError:
+        return False
+    return stat.rpartition(")")[2].split()[0] == _STOPPED
