@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from pillow_heif import register_heif_opener
 
-from app.processes.process_client import ProcessUnavailable
-from app.processes.process_server import OutOfMemory
+from app.processes.client import ProcessUnavailable
+from app.processes.server import OutOfMemory
 from app.storage.photos import GOAL_SIDE, Photo, PhotoCrop, PhotoReader, PhotoRefused, central_crop, check_crop, cut_out
 from app.storage.photos import read_photo as decoded
 from osfcore.errors import InvalidInput
