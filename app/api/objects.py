@@ -13,6 +13,7 @@ from app.api.bodies import PNG, upload
 from app.api.dependencies import Services, ServicesDep, slow
 from app.api.jobs import JobOut
 from app.api.models import FileName, Label, ObjectName, Vector3
+from app.api.paging import DamagedOut
 from app.api.problems import named_in_path, problems
 from osfcore.errors import OsfError
 from osfcore.objects.asset import ObjectInfo
@@ -74,6 +75,7 @@ class ObjectList(BaseModel):
     """All known objects."""
 
     objects: list[ObjectOut]
+    damaged: list[DamagedOut] = Field(description="What can only be fetched again or deleted.")
 
 
 UPLOAD_PATH = "/api/objects"
@@ -90,7 +92,8 @@ def list_all(services: ServicesDep) -> ObjectList:
     for name in names:
         with contextlib.suppress(OsfError):  # a damaged object of the user's must not hide the others
             listed.append(_object(services, name))
-    return ObjectList(objects=listed)
+    damaged = [DamagedOut(id=name, reason=reason) for name, reason in services.runner.library.damaged().items()]
+    return ObjectList(objects=listed, damaged=damaged)
 
 
 @router.post("", status_code=202, responses=problems(409, 429, 507), openapi_extra=_MESH_BODY)
@@ -123,7 +126,7 @@ def get(services: ServicesDep, name: Name) -> ObjectOut:
 
 @router.delete("/{name}", response_class=Response, status_code=204, responses=problems(404, 409, 507))
 def delete(services: ServicesDep, name: Name) -> Response:
-    """Delete an object that was added here; its field stays, and counts again for a new object of that name."""
+    """Delete an object that was added here, damaged or not; its field stays, for a new object of that name."""
     with named_in_path():
         services.own_objects.delete(name)
     services.objects.outdate()
@@ -149,6 +152,7 @@ def _object(services: Services, name: str) -> ObjectOut:
     library = services.runner.library
     info = library.info(name)
     try:
+        library.check(name)
         size_m, version = library.size_m(name), library.digest(name)[:12]
     except OsfError:  # not fetched, or damaged
         size_m, version = None, None

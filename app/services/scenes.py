@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from app.processes.client import ProcessClient, Status
 from app.processes.messages.scene_messages import (
     Act,
     AdoptScene,
@@ -28,13 +29,12 @@ from app.processes.messages.scene_messages import (
     TakeMask,
     WatchFrames,
 )
-from app.processes.process_client import ProcessClient, Status
 from app.processes.sim_process import simulation_main
 from app.services.event_hub import CurrentScene, Hub, Notice
 from app.services.scene_images import SceneImages
 from app.services.service_settings import Settings
 from app.storage.database import CannotStore, Store, now_utc
-from osfcore.errors import InvalidInput, MissingAssets, NotThere, OsfError
+from osfcore.errors import InvalidInput, NotThere, OsfError
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -327,13 +327,8 @@ class Scenes:
         if len(set(names or ())) != len(names or ()):
             raise InvalidInput("list of objects", ", ".join(names or ()), "without repetition")
         for name in names or ():
-            self._check_object(name)
+            self.library.check(name)
         return names
-
-    def _check_object(self, name: str) -> None:
-        if not self.library.has(name):
-            self.library.info(name)  # raises UnknownName for what nobody knows
-            raise MissingAssets([name])
 
     def _check_free(self, scene: str) -> None:
         by = self.holder(scene)

@@ -8,6 +8,7 @@ is written leaves either the old object or none.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import io
 import json
@@ -34,6 +35,7 @@ FORMAT_VERSION = 1
 _FACTS, _ARRAYS, _TEXTURE, _VIEWER = "object.json", "arrays.npz", "texture.png", "viewer.glb"
 _TEMPORARY_PREFIX = ".writing-"
 _NAME = re.compile(r"(?=[\w.-]*[\d_])[\w.-]*\w")  # a whole word with a digit or an underscore
+_WRONG_CHECKSUM = "its checksum does not fit; fetch or add it again with --force"
 _TEMPORARY_LIFE_S = 600  # far longer than one write takes; older ones were left by a killed process
 
 
@@ -54,16 +56,43 @@ class AssetLibrary:
 
     def names(self) -> tuple[str, ...]:
         """Return the names of all objects that can be loaded, sorted."""
-        if not self.root.is_dir():
-            return ()
-        return tuple(sorted(entry.name for entry in self.root.iterdir() if self.has(entry.name)))
+        return tuple(name for name in self._folders() if self.has(name))
+
+    def damaged(self) -> dict[str, str]:
+        """Return why objects on this machine cannot be loaded, by name."""
+        found = {}
+        for name in self._folders():
+            try:
+                self.check(name)
+            except CorruptFile as error:
+                found[name] = error.reason
+            except OsfError:
+                found[name] = f"{_FACTS} is missing"
+        return found
 
     def has(self, name: str) -> bool:
-        """Whether an object of this name has been written (by a version that this one can read)."""
+        """Whether there is an object of this name, written by a version that this one can read, and not damaged."""
         try:
-            return _is_plain(name) and self._facts(name)["format_version"] == FORMAT_VERSION
-        except (OSError, CorruptFile):
+            self.check(name)
+        except OsfError:
             return False
+        return True
+
+    def check(self, name: str) -> None:
+        """Check that an object can be loaded, by the checksums of its files, each of which is read once.
+
+        Raises:
+            MissingAssets: if the object is in the catalogue but not on this machine.
+            UnknownName: if there is no such object.
+            CorruptFile: if its files are damaged.
+        """
+        with self._reading(name) as facts:
+            decode(ObjectInfo, facts["info"], "info")
+            for file in (_ARRAYS, _TEXTURE, _VIEWER):
+                path = self.root / name / file
+                state = path.stat()
+                if _crc32(path, state.st_ino, state.st_size, state.st_mtime_ns) != facts["crc32"][file]:
+                    raise CorruptFile(path, _WRONG_CHECKSUM)
 
     def info(self, name: str) -> ObjectInfo:
         """Return the facts of an object of the catalogue, fetched or not, or of one that a user added.
@@ -185,20 +214,27 @@ class AssetLibrary:
             replace_folder(folder, self.root / asset.info.name)
 
     def remove(self, name: str) -> None:
-        """Delete an object that a user added.
+        """Delete an object that a user added, damaged or not.
 
         Raises:
             UnknownName: if there is no such object.
             InvalidInput: if it is the catalogue's.
             CannotWrite: if that is not allowed.
         """
-        self._known_facts(name)
+        if name not in self._folders():
+            raise UnknownName("object", name, {*CATALOGUE, *self.names()})
         if name in CATALOGUE:
             raise InvalidInput("object to delete", name, "one that was added here; the catalogue's stay")
         with writing(self.root):
             with self._scratch() as trash:
                 (self.root / name).rename(trash / "old")
             sync(self.root)
+
+    def _folders(self) -> tuple[str, ...]:
+        """Return the names of all objects, damaged or not, sorted."""
+        if not self.root.is_dir():
+            return ()
+        return tuple(sorted(entry.name for entry in self.root.iterdir() if _is_plain(entry.name) and entry.is_dir()))
 
     def _facts(self, name: str) -> dict[str, Any]:
         path = self.root / name / _FACTS
@@ -216,7 +252,8 @@ class AssetLibrary:
         except OSError:
             if name in CATALOGUE:
                 raise MissingAssets([name]) from None
-            raise UnknownName("object", name, {*CATALOGUE, *self.names()}) from None
+            written = (other for other in self._folders() if (self.root / other / _FACTS).is_file())
+            raise UnknownName("object", name, {*CATALOGUE, *written}) from None
         if facts["format_version"] != FORMAT_VERSION:
             reason = "another version of this program wrote it; fetch or add the object again with --force"
             raise CorruptFile(self.root / name, reason)
@@ -229,7 +266,7 @@ class AssetLibrary:
     def _checked(self, name: str, file: str, facts: dict[str, Any]) -> bytes:
         data = (self.root / name / file).read_bytes()
         if zlib.crc32(data) != facts["crc32"][file]:
-            raise CorruptFile(self.root / name / file, "its checksum does not fit; fetch or add it again with --force")
+            raise CorruptFile(self.root / name / file, _WRONG_CHECKSUM)
         return data
 
     @contextlib.contextmanager
@@ -246,6 +283,13 @@ class AssetLibrary:
 
     def _scratch(self) -> contextlib.AbstractContextManager[Path]:
         return scratch_folder(self.root, _TEMPORARY_PREFIX, _TEMPORARY_LIFE_S)
+
+
+@functools.lru_cache(maxsize=1024)
+def _crc32(path: Path, inode: int, size: int, mtime_ns: int) -> int:
+    """Return the checksum of a file, which has not changed as long as the other arguments are the same."""
+    del inode, size, mtime_ns
+    return zlib.crc32(path.read_bytes())
 
 
 def _parts(arrays: dict[str, np.ndarray]) -> tuple[Float[np.ndarray, "_ 3"], ...]:

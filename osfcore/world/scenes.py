@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from osfcore.errors import InvalidInput, MissingAssets, NoRoom, OsfError, OverlappingObjects, check_ranges, check_unique
+from osfcore.errors import InvalidInput, NoRoom, OsfError, OverlappingObjects, check_ranges, check_unique
 from osfcore.geometry.light import Light, SpotLamp
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import MAX_OBJECTS
@@ -44,10 +44,9 @@ def check_object(library: AssetLibrary, name: str) -> None:
     Raises:
         UnknownName: if the catalogue does not know it.
         MissingAssets: if its mesh has not been fetched.
+        CorruptFile: if its files are damaged.
     """
-    if not library.has(name):
-        library.info(name)  # raises UnknownName for what no catalogue knows
-        raise MissingAssets([name])
+    library.check(name)
 
 
 def check_request(library: AssetLibrary, request: SceneRequest) -> None:

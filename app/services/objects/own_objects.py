@@ -72,7 +72,7 @@ class OwnObjects:
             return await run_in_threadpool(self._queue, new, folder, file_name)
 
     def delete(self, name: str) -> None:
-        """Delete an object that was added here.
+        """Delete an object that was added here, damaged or not.
 
         Raises:
             UnknownName: if there is none.
@@ -80,15 +80,15 @@ class OwnObjects:
             ObjectNeeded: if a scene or a job uses it.
             CannotWrite: if the disk refuses.
         """
-        info = self._runner.library.info(name)
+        label = self._runner.library.label(name)
         if name in CATALOGUE:
-            raise CatalogueObject(info.label)
+            raise CatalogueObject(label)
         scenes = sum(name in record.state.names for record in self._runner.scenes())
         if scenes:
             which = "a scene; delete that scene first" if scenes == 1 else f"{scenes} scenes; delete those scenes first"
-            raise ObjectNeeded(info.label, which)
+            raise ObjectNeeded(label, which)
         if any(_needs(job, name) for job in self._runner.jobs.live()):
-            raise ObjectNeeded(info.label, "a job that waits or runs; wait for it or cancel it first")
+            raise ObjectNeeded(label, "a job that waits or runs; wait for it or cancel it first")
         self._runner.library.remove(name)
         self._runner.storage.outdate()
 

@@ -30,15 +30,35 @@ def test_one_object_has_its_size(service, library):
     assert found["licence"] == "CC-BY-4.0"
 
 
-def test_a_damaged_object_does_not_hide_the_others(service, services, library):
+def test_a_damaged_object_does_not_hide_the_others_and_can_be_deleted(service, services, library):
     damaged = services.runner.library.root / "zz"
     damaged.mkdir()
     (damaged / "object.json").write_text('{"format_version": 1}')
     try:
-        listed = {o["name"] for o in service.get("/api/objects").json()["objects"]}
+        listed = service.get("/api/objects").json()
+        assert {o["name"] for o in listed["objects"]} >= set(library.names())
+        assert [each["id"] for each in listed["damaged"]] == ["zz"]
+        assert service.delete("/api/objects/zz").status_code == 204
+        assert service.get("/api/objects").json()["damaged"] == []
     finally:
-        shutil.rmtree(damaged)
-    assert listed >= set(library.names())
+        shutil.rmtree(damaged, ignore_errors=True)
+
+
+@pytest.mark.slow
+def test_a_damaged_object_is_fetched_again_and_drawn_for_no_table(library, tmp_path):
+    with running(library, tmp_path) as client:
+        broken, *whole = library.names()
+        path = tmp_path / "objects" / broken / "arrays.npz"
+        data = path.read_bytes()
+        path.unlink()  # it is a link to what other tests use
+        path.write_bytes(data[: len(data) // 2])
+        listed = client.get("/api/objects").json()
+        assert [each["id"] for each in listed["damaged"]] == [broken]
+        assert {o["name"] for o in listed["objects"] if o["available"]} == set(whole)
+        for seed in range(3):
+            made = client.post("/api/scenes", json={"count": len(whole), "seed": seed})
+            assert {entry["name"] for entry in made.json()["objects"]} == set(whole)
+        assert broken in is_problem(client.post("/api/scenes", json={"objects": [broken]}), 409)["detail"]
 
 
 def test_unknown_objects_are_not_found(service):
