@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 
 import tyro
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from osfcore.objects.asset_library import AssetLibrary
 
 T = TypeVar("T")
+Device = Annotated[
+    Literal["auto", "cpu", "cuda"], tyro.conf.arg(help="What computes; auto takes a GPU where there is one.")
+]
 Flat = Annotated[T, tyro.conf.arg(name="")]  # settings of the core whose fields are options of the command itself
 
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import tyro
 
-from app.cli.command import DataCommand, follow, report_of
+from app.cli.command import DataCommand, Device, follow, report_of
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,7 @@ class RunEpisode(DataCommand):
     """Of the softmax, as a share of the spread of costs."""
     despite_doubts: bool = False
     """Go on with a goal image that is not explained well, or with objects of a photo that are doubtful."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What computes; auto takes a GPU where there is one."""
+    device: Device = "auto"
 
     def run(self) -> dict[str, Any]:
         """Run it with a progress bar; the result is report.json without the single steps."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from app.cli.command import DataCommand, check_out, follow
+from app.cli.command import DataCommand, Device, check_out, follow
 from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -145,8 +145,7 @@ class Predict(DataCommand):
     """With --images: which sequence."""
     method: Literal["ours", "paper"] = "ours"
     """Whose model: ours; the paper's as published, for which --before plays no part."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What computes; auto takes a GPU where there is one."""
+    device: Device = "auto"
 
     def run(self) -> dict[str, Any]:
         """Predict; the result has how far each object goes at most [mm], and PSNR by step where it is known."""
@@ -235,8 +234,7 @@ class Render(DataCommand):
     """PNG to write."""
     camera: str = "0"
     """Name of one of the scene's cameras; of 0 to 3 and goal, the usual ones, if it has none."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What computes; auto takes a GPU where there is one."""
+    device: Device = "auto"
 
     def run(self) -> dict[str, Any]:
         """Render with two by two rays a pixel; the result has the file and its size."""

@@ -438,25 +438,19 @@ class ReproduceCommand(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds all figures of the report."""
-        from osfcore.experiments.reproduction.reproduction import (
-            PAGE_FILE,
-            PARTS,
-            QUICK,
-            About,
-            Reproduce,
-            Scale,
-            reproduce,
-        )
+        from osfcore.experiments.reproduction import reproduction as paper
 
         need("experiments", "This command")  # before hours of work
-        scale = self._changed(QUICK if self.quick else Scale())
+        scale = self._changed(paper.QUICK if self.quick else paper.Scale())
         system = f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}"
         called = shlex.join(["osf", *sys.argv[1:]])
-        about = About(date.today().isoformat(), f"{os.cpu_count()} cores, {system}", called, self.seed, ())
-        config = Reproduce(self.out, self.data_dir, about, scale, self.quick, self.only or PARTS, self.names)
+        about = paper.About(date.today().isoformat(), f"{os.cpu_count()} cores, {system}", called, self.seed, ())
+        config = paper.Reproduce(
+            self.out, self.data_dir, about, scale, self.quick, self.only or paper.PARTS, self.names
+        )
         with worker_pool(self.workers, self.cluster) as executor:
-            report = report_of(reproduce(config, self.trained, self.assets, executor))
-        self.say(*report["findings"], f"The report: {self.out / PAGE_FILE}")
+            report = report_of(paper.reproduce(config, self.trained, self.assets, executor))
+        self.say(*report["findings"], f"The report: {self.out / paper.PAGE_FILE}")
         return report
 
     def _changed(self, scale: Scale) -> Scale:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -45,7 +44,7 @@ class ExportScene(DataCommand):
         library, fields = self.assets, self.trained
         scanned = [name for name in scene.state.names if library.has(name) and not self.fields]
         shapes = {n: library.load(n).mesh if n in scanned else fields.load(n) for n in scene.state.names}
-        size = _write(self.out, lambda: export(scene, shapes, fields.load_table()))
+        size = _write(self.out, export(scene, shapes, fields.load_table()))
         others = [name for name in scene.state.names if name not in scanned]
         x, y, z = scene.state.light.direction
         self.say(f"Wrote {self.out}, {size / 1e6:.1f} MB; light toward ({x:.3f}, {y:.3f}, {z:.3f}).")
@@ -75,7 +74,7 @@ class ExportField(DataCommand):
 
             export = partial(field_usd, is_packed=suffix == ".usdz")
         light, shape = None if self.light is None else _light(self.light), _field(self.name, self.data_dir)
-        size = _write(self.out, lambda: export(shape, Path(self.name).stem, light))
+        size = _write(self.out, export(shape, Path(self.name).stem, light))
         colours = "the albedo" if light is None else f"those under the light toward {self.light}, baked in"
         self.say(f"Wrote {self.out}, {size / 1e6:.1f} MB; its colours are {colours}.")
         return {"out": str(self.out), "bytes": size, "colours": "albedo" if light is None else "baked"}
@@ -98,7 +97,7 @@ class ExportSplats(DataCommand):
 
         check_out(self.out, ".ply")
         splats = field_splats(_field(self.name, self.data_dir), _light(self.light))
-        size, count = _write(self.out, lambda: splats_ply(splats)), len(splats.means)
+        size, count = _write(self.out, splats_ply(splats)), len(splats.means)
         self.say(f"Wrote {self.out}, {count} Gaussians; lighting baked in, light toward {self.light}.")
         return {"out": str(self.out), "bytes": size, "splats": count, "light": splats.light.direction.tolist()}
 
@@ -118,10 +117,9 @@ def _field(name: str, data_dir: Path) -> KiloOSF:
     return read_field(Path(name)) if name.endswith(".safetensors") else FieldLibrary(data_dir).load(name)
 
 
-def _write(out: Path, made: Callable[[], bytes]) -> int:
+def _write(out: Path, data: bytes) -> int:
     from osfcore.io.files import write_atomically
 
-    data = made()
     write_atomically(out, data)
     return len(data)
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand
+from app.cli.command import Command, DataCommand, Device
 from osfcore.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -110,8 +110,7 @@ class RobotDriveCommand(DataCommand):
     """Of the searches."""
     despite_doubts: bool = False
     """Go on with a goal photo that is not explained well."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What computes; auto takes a GPU where there is one."""
+    device: Device = "auto"
 
     def run(self) -> dict[str, Any]:
         """Drive; the result is report.json without the single steps."""

@@ -110,8 +110,10 @@ def _settings(serve: Serve) -> tuple[Settings, str]:
     from app.services.robot import host_of, limits_of
     from app.services.service_settings import Settings
 
+    robot: dict[str, Any] = {"robot": serve.robot, "robot_box": serve.box, "robot_top_speed_m_s": serve.top_speed}
+    given = {name: value for name, value in robot.items() if value is not None}  # the environment has the rest
     try:
-        settings = Settings(host=serve.host, port=serve.port, data_dir=serve.data_dir, **_robot(serve))
+        settings = Settings(host=serve.host, port=serve.port, data_dir=serve.data_dir, **given)
     except ValidationError as error:
         first = error.errors()[0]
         name = "OSF_" + "_".join(str(part) for part in first["loc"]).upper()
@@ -123,12 +125,6 @@ def _settings(serve: Serve) -> tuple[Settings, str]:
         token = secrets.token_urlsafe(24)
         return settings.model_copy(update={"token": SecretStr(token)}), f"/?token={token}"
     return settings, ""
-
-
-def _robot(serve: Serve) -> dict[str, Any]:
-    """What was said of a robot; the environment has the rest."""
-    given = {"robot": serve.robot, "robot_box": serve.box, "robot_top_speed_m_s": serve.top_speed}
-    return {name: value for name, value in given.items() if value is not None}
 
 
 def is_loopback(host: str) -> bool:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand, Flat, follow
+from app.cli.command import Command, DataCommand, Device, Flat, follow
 from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput
 from osfcore.experiments.rivals.train_fitvid import TrainFitVid, train_fitvid
@@ -34,8 +34,7 @@ class TrainFieldCommand(Command):
     folder for files that are named after those of the sets."""
     minutes: float = 30.0
     """How long to train each [min]."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What computes; auto takes a GPU where there is one."""
+    device: Device = "auto"
     seed: int = 0
     """Of everything random."""
     hollow: bool = False
@@ -123,8 +122,7 @@ class TrainTableCommand(Command):
     """Folder with train/anno.json and test/anno.json, such as 'osf collect table' writes."""
     out: Path
     """File to write, such as table.safetensors; its metrics go beside it as .json."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What computes; auto takes a GPU where there is one."""
+    device: Device = "auto"
     seed: int = 0
     """Of everything random."""
 
@@ -164,8 +162,7 @@ class TrainDynamicsCommand(DataCommand):
     """Of ours: windows in each (default 96)."""
     rate: float | None = None
     """Of learning, at its highest (ours 0.004, paper 0.001)."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What computes; auto takes a GPU where there is one."""
+    device: Device = "auto"
     seed: int = 0
     """Of everything random."""
 

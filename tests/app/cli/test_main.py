@@ -95,7 +95,7 @@ def test_json_is_the_last_line_and_keys_are_stable(data_dir):
         (1, ("check", "{tmp}/nothing"), "no such file"),
         (2, ("assets", "fetch", "teapot"), "teapot"),
         (2, ("assets", "fetch", "--source", "{tmp}/nowhere"), "nowhere"),
-        (1, ("assets", "add", "{tmp}/nothing.obj", "--name", "x", "--mass", "1"), "nothing.obj"),
+        (2, ("assets", "add", "{tmp}/nothing.obj", "--name", "x", "--mass", "1"), "nothing.obj"),
     ],
 )
 def test_failures_exit_with_1_and_mistakes_in_the_call_with_2_in_one_sentence(
