@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import time
@@ -38,6 +39,8 @@ from osfcore.metrics.image_errors import ssim
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.paper.method import Method
+
+_UNWRITTEN_SHARE = 0.05  # of the steps, at most
 
 
 class Table(Protocol):
@@ -101,6 +104,10 @@ class About:
 class EpisodeRecord:
     """Takes an episode's events and writes its results.
 
+    Report, course and table are written whole, each time a twentieth of the steps has come since the last time: after
+    every step of the first twenty, and later so seldom that writing takes time in proportion to the number of steps.
+    Whoever breaks an episode off calls `close`, which writes the rest; one that is killed loses that twentieth.
+
     Args:
         folder: for them.
         table: that the episode is about.
@@ -109,6 +116,7 @@ class EpisodeRecord:
 
     Attributes:
         seconds: that it took so far, as the report has them [s].
+        steps_written: how many steps the report holds.
     """
 
     def __init__(
@@ -121,6 +129,7 @@ class EpisodeRecord:
         self._steps: list[dict[str, Any]] = []
         self._notices: list[dict[str, Any]] = []
         self.seconds = self._seconds = 0.0
+        self.steps_written = 0
         self._clock, self._since = clock, clock()
         self._actions: list[list[float]] = []
         self._end: Finished | None = None
@@ -163,7 +172,9 @@ class EpisodeRecord:
                 self._end = event
             case _:
                 pass
-        if isinstance(event, GoalFound | Noticed | Stepped | Finished):
+        unwritten = len(self._steps) - self.steps_written
+        is_due = unwritten > 0 and unwritten >= _UNWRITTEN_SHARE * len(self._steps)
+        if is_due or isinstance(event, GoalFound | Noticed | Finished):
             self._write()
 
     def go_on(self) -> None:
@@ -179,9 +190,15 @@ class EpisodeRecord:
         write_video(self._folder / VIDEO_FILE, read_frames(self._folder / FRAMES_FOLDER))
         return self._write()
 
+    def close(self) -> None:
+        """Write the steps that are not in the files yet, as far as the disk takes them."""
+        if self.steps_written < len(self._steps):
+            with contextlib.suppress(OsfError):  # what ended the episode is what is reported
+                self._write()
+
     def _write(self) -> dict[str, Any]:
-        """Report and table so far: an episode that is broken off leaves what it has done."""
-        self.seconds = round(self._seconds, 2)
+        """Write report, course and table so far, and return the report."""
+        self.seconds, self.steps_written = round(self._seconds, 2), len(self._steps)
         report = self._report()
         write_json(self._folder / REPORT_FILE, report)
         write_trajectory(self._folder / TRAJECTORY_FILE, self._course.trajectory)

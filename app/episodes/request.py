@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -266,12 +267,13 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
         record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
         rng = stream_rng(order.seed, Stream.EPISODE)
         done, note = 0, ""
-        for event in Episode(begin.world, models, begin.goal, order.settings, rng, parts=parts).run():
-            record.take(event)
-            done = event.number if isinstance(event, ActionExecuted) else done
-            total = event.steps if isinstance(event, Stepped) else total
-            note = note_of(event) or note
-            yield EpisodeStep(done, total, note, event)
+        with contextlib.closing(record):
+            for event in Episode(begin.world, models, begin.goal, order.settings, rng, parts=parts).run():
+                record.take(event)
+                done = event.number if isinstance(event, ActionExecuted) else done
+                total = event.steps if isinstance(event, Stepped) else total
+                note = note_of(event) or note
+                yield EpisodeStep(done, total, note, event)
         yield EpisodeStep(done, total, "Writing video and recording")
         report = record.finish()
         write_recording(order.out / RECORDING_FILE, assets, record.states)

@@ -7,6 +7,7 @@ known, is for the report alone. It leaves what `osf episode` leaves. The method 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -118,16 +119,19 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
         loop = _Published(world, models, image, settings, rng)
     progress, timer = EpisodeProgress(0, 0, "Looking"), TimeLeft(finds_goal=image is None)
     pictures = LookPictures(models.appearance.together, wanted)
-    for event in loop.run():
-        for change in place.orders.changes():
-            loop.settings = settings_of(change["settings"])
-        record.take(event)
-        share, left_s = timer.take(event, progress.total or settings.steps)
-        then = _progress_after(progress, pictures.drawn(event))
-        progress = replace(then, share=share, left_s=round(left_s, 1), seconds=record.seconds)
-        yield progress
-        timer.go_on()  # not before a pause is over
-        record.go_on()
+    with contextlib.closing(record):
+        for event in loop.run():
+            for change in place.orders.changes():
+                loop.settings = settings_of(change["settings"])
+            record.take(event)
+            share, left_s = timer.take(event, progress.total or settings.steps)
+            then = _progress_after(progress, pictures.drawn(event))
+            progress = replace(
+                then, share=share, left_s=round(left_s, 1), seconds=record.seconds, steps=record.steps_written
+            )
+            yield progress
+            timer.go_on()  # not before a pause is over
+            record.go_on()
     yield replace(progress, note="Writing video and recording", view=None)
     record.finish()
     write_recording(place.folder / RECORDING_FILE, place.library, record.states)
@@ -205,7 +209,7 @@ def _progress_after(before: EpisodeProgress, event: Event) -> EpisodeProgress:
         case ActionExecuted(number):
             return replace(then, done=number, view=event)
         case Stepped():
-            return replace(then, total=event.steps, steps=before.steps + 1, view=event)
+            return replace(then, total=event.steps, view=event)
         case Finished(_, outcome, text):
             return replace(then, outcome=outcome, text=text, note=text, view=event)
         case _:

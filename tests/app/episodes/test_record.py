@@ -220,6 +220,21 @@ def test_whatever_is_broken_off_has_left_every_step_until_then(told):
     assert {path.name for path in told.out.iterdir()} == files
 
 
+def test_a_long_episode_writes_its_files_ever_more_seldom_and_lacks_few_steps(told):
+    record = told.record(told.goal)
+    told.begin(record)
+    written = []
+    for number in range(1, 50):
+        told.step(record, number, {"estimate": 0.5})
+        report = json.loads((told.out / REPORT_FILE).read_text())
+        assert len(report["steps"]) == record.steps_written > 0.95 * number
+        written.append(record.steps_written)
+    assert written[:20] == [*range(2, 21), 20]
+    assert len(set(written)) < 40
+    record.close()
+    assert len(rows(told.out)) == record.steps_written == 50
+
+
 def test_what_is_noticed_is_in_the_file_at_once(told):
     record = told.record(told.goal)
     record.take(Noticed(0, "goal", "The goal image is odd."))
