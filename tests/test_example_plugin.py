@@ -52,7 +52,7 @@ def test_its_parts_are_listed_beside_ours(installed):
 
 
 def test_an_unknown_part_is_told_before_anything_begins(tmp_path, data_dir, capsys):
-    assert main(["episode", "--out", str(tmp_path / "out"), "--planner", "luck", "--data-dir", str(data_dir)]) == 1
+    assert main(["episode", "--out", str(tmp_path / "out"), "--planner", "luck", "--data-dir", str(data_dir)]) == 2
     assert capsys.readouterr().err.endswith("osf: There is no planner named 'luck'; known: mppi.\n")
     with pytest.raises(UnknownName, check=about("world")):
         given(EpisodeOrder(tmp_path, data_dir, (NAME,), parts=PartNames(world="real")))

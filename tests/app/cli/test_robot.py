@@ -169,14 +169,14 @@ def test_an_interruption_stops_it(robot, tmp_path, monkeypatch, capsys):
 )
 def test_what_cannot_be_is_told_before_anything_moves(robot, tmp_path, capsys, more, words):
     before = robot[1].truth().pusher
-    assert drive(robot[0], tmp_path, "--yes", *more) == 1
+    assert drive(robot[0], tmp_path, "--yes", *more) == 2
     assert words in capsys.readouterr().err
     np.testing.assert_array_equal(robot[1].truth().pusher, before)
 
 
 def test_a_goal_of_another_shape_is_told(robot, tmp_path, capsys):
     write_png(tmp_path / "0.png", np.zeros((64, 80, 3), np.uint8))
-    assert drive(robot[0], tmp_path, "--yes") == 1
+    assert drive(robot[0], tmp_path, "--yes") == 2
     assert "size of 0.png [px] is 80 x 64, but it must be in proportion 64:64" in capsys.readouterr().err
 
 
