@@ -22,7 +22,7 @@ from starlette.concurrency import run_in_threadpool
 from app.storage.database import CannotStore, now_utc
 from app.storage.uploads import Examiner, save
 from osfcore.errors import CorruptFile, InvalidInput, NotThere, OsfError, shown
-from osfcore.io.files import put_in_place, read_json
+from osfcore.io.files import put_in_place, read_json, remove_folder
 from osfcore.io.json_codec import Text, decode
 
 _ARCHIVE, _IMAGES, _OVERLAY, _FACTS = "set.zip", "images", "overlay.png", "set.json"
@@ -91,7 +91,7 @@ class ImageSets:
 
     def start(self) -> None:
         """Remove what an earlier service left half done."""
-        for folder in self._root.glob(f"{_TEMPORARY_PREFIX}*"):
+        for folder in self._root.glob(".*"):
             shutil.rmtree(folder, ignore_errors=True)
 
     def stop(self) -> None:
@@ -134,12 +134,10 @@ class ImageSets:
             UnknownName: if there is none.
         """
         self.get(set_id)
-        trash = self._root / f"{_TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}"
         try:
-            (self._root / set_id).rename(trash)
+            remove_folder(self._root / set_id)
         except OSError as error:
             raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
-        shutil.rmtree(trash, ignore_errors=True)
 
     async def receive(self, chunks: AsyncIterator[bytes], file_name: str) -> SetRecord:
         """Take in an uploaded zip, bit by bit, and keep the set in it if it is sound.

@@ -1,3 +1,4 @@
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 
 from app.jobs.folders import JobFolders
+from app.services.image_sets import ImageSets
 from app.storage.field_files import (
     install,
     install_published,
@@ -123,6 +125,14 @@ def test_inputs_of_a_job_outlive_a_power_failure(tmp_path, synced):
         folders.take("j", folder)
     assert is_safe(synced, folders.inputs("j"))
     assert (tmp_path / "collections").stat().st_ino in synced
+
+
+def test_a_deleted_set_of_images_stays_deleted_after_a_power_failure(tmp_path, synced):
+    facts = {"id": "s", "file_name": "s.zip", "created_at": "2026", "train": 1, "test": 1, "summary": ""}
+    write_atomically(tmp_path / "sets" / "s" / "set.json", json.dumps(facts).encode())
+    synced.clear()
+    ImageSets(tmp_path / "sets").remove("s")
+    assert synced[-1] == (tmp_path / "sets").stat().st_ino
 
 
 def test_deleted_fields_and_leftovers_of_training_stay_deleted_after_a_power_failure(tmp_path, synced):
