@@ -121,9 +121,10 @@ def _refuse(sentence: str, code: int) -> int:
 
 def _drop_output() -> None:
     """Let go of standard output if it cannot be written, so that the interpreter does not try again as it ends."""
+    if sys.stdout is None:
+        return
     try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
