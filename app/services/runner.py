@@ -141,11 +141,13 @@ class Runner(Scenes):
 
     def storing_problem(self) -> str | None:
         """Why something is not stored, for people; None if all is. Tries to write now and then."""
-        if self.unwritten:
-            changed = "one scene or job" if self.unwritten == 1 else f"{self.unwritten} scenes and jobs"
-            return f"What has become of {changed} could not be stored; it is tried again."
         if time.monotonic() - self._probed_at > _PROBE_S:
             self._probed_at, self._refusal = time.monotonic(), self._store.probe()
+        if self.unwritten:
+            changed = "one scene or job" if self.unwritten == 1 else f"{self.unwritten} scenes and jobs"
+            return (
+                f"What has become of {changed} could not be stored; it is tried again. {self._refusal or ''}".rstrip()
+            )
         return self._refusal
 
     @property

@@ -15,7 +15,7 @@ from app.services.event_hub import CurrentScene, Notice
 from app.services.runner import DemoScene, Runner, SceneNeeded, TrainingAlready
 from app.services.scenes import SceneHeld, TooManyScenes
 from app.services.service_settings import Settings
-from app.storage.database import CannotStore, Store
+from app.storage.database import FILE, CannotStore, Store
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -366,6 +366,16 @@ def test_what_a_hand_moves_on_a_full_disk_is_refused_and_undone(open_runner):
         assert runner.unwritten == 0
     again = runner.edit_scene(made.id, light=Light(np.array([0.5, 0.0, 1.5])))
     assert open_runner(demo_scene=False).scene(made.id).revision == again.revision
+
+
+@pytest.mark.slow
+def test_that_the_database_was_deleted_is_a_problem_with_a_reason(open_runner, data_dir):
+    runner = open_runner(demo_scene=False)
+    scene = runner.create_scene(names=(BOX,), seed=3)
+    (data_dir / FILE).unlink()
+    runner.activate(scene.id)
+    assert runner.unwritten == 1
+    assert FILE in runner.storing_problem()
 
 
 def test_what_is_set_aside_at_the_start_is_told(open_runner, data_dir, caplog):
