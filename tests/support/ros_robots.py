@@ -27,7 +27,7 @@ TABLE_CAMERAS = ("north", "east", "south", "west")
 QUERY = f"cameras={','.join(TABLE_CAMERAS)}"
 T_BASE_TABLE = Pose(np.array([0.4, 0.1, 0.02]), np.array([np.cos(0.3), 0, 0, np.sin(0.3)]))
 _HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-_MOVES_S = 0.05
+_MOVES_S = 0.01
 
 
 def transform(parent, child, pose):
@@ -49,13 +49,14 @@ class StandIn:
         self.pictures = dict.fromkeys(cameras, jpeg(np.full((SIDE, SIDE, 3), 100, np.uint8)))
         self.twists, self.frames, self.silent = [], [], set()
         self._commands, self._coming = [(time.monotonic(), np.zeros(2))], threading.Lock()
-        self._moved_until = time.monotonic()
+        self._moved_until, self._using = time.monotonic(), threading.RLock()
         self.extra, self.noise = {}, []
         self._ends = threading.Event()
         self._sockets = []
 
     def messages(self):
-        """By topic, what is published now."""
+        """By topic, what is published now: the pusher where it is by now, however late its own thread is."""
+        self._catch_up()
         published, static = {}, [transform("base", "table", T_BASE_TABLE)]
         for name, camera in self.cameras.items():
             published[f"/{name}/image_raw/compressed"] = {"format": "jpeg", "data": self.pictures[name]}
@@ -115,7 +116,11 @@ class StandIn:
 
     def control(self):
         """Move the pusher as twists say, until the end."""
-        while not self._ends.wait(0.005):
+        while not self._ends.wait(_MOVES_S):
+            self._catch_up()
+
+    def _catch_up(self):
+        with self._using:
             for velocity, seconds in self._motions():
                 self.pusher = self.pusher + seconds * np.array([*velocity, 0.0])
 
@@ -155,7 +160,7 @@ class TableStandIn(StandIn):
 
     def __init__(self, table):
         super().__init__(dict(zip(TABLE_CAMERAS, table.cameras, strict=True)))
-        self.table, self._using = table, threading.RLock()
+        self.table = table
         self._look()
 
     def load(self, state):
@@ -164,14 +169,13 @@ class TableStandIn(StandIn):
             self.table.load(state)
             self._look()
 
-    def control(self):
-        while not self._ends.wait(_MOVES_S):
+    def _catch_up(self):
+        with self._using:
             motions = self._motions()
+            for velocity, seconds in motions:
+                self.table.act(np.array([*velocity, 0.0]) * seconds / STEP_S)
             if motions:
-                with self._using:
-                    for velocity, seconds in motions:
-                        self.table.act(np.array([*velocity, 0.0]) * seconds / STEP_S)
-                    self._look()
+                self._look()
 
     def _look(self):
         self.pusher = self.table.truth().pusher
