@@ -18,7 +18,7 @@ from osfcore.contrib.robots.robot import RobotRefused
 from osfcore.control import estimators
 from osfcore.io.image_file import write_png
 from tests.live import free_port
-from tests.support.robots import NAMES, example, serving, simulated, tell_truth, toward_middle, until
+from tests.support.robots import NAMES, example, know_truth, serving, simulated, toward_middle, until
 from tests.support.ros_robots import StandIn
 
 GUIDE = Path(__file__).parents[3] / "docs" / "robots.md"
@@ -39,7 +39,7 @@ def robot(server, tmp_path, monkeypatch):
     wanted = toward_middle(start)
     write_png(tmp_path / "0.png", np.zeros((64, 64, 3), np.uint8))
 
-    tell_truth(monkeypatch, table, wanted)
+    know_truth(monkeypatch, table, wanted)
     yield url, table
     table.restore(start)
 
