@@ -145,9 +145,8 @@ class Runner(Scenes):
             self._probed_at, self._refusal = time.monotonic(), self._store.probe()
         if self.unwritten:
             changed = "one scene or job" if self.unwritten == 1 else f"{self.unwritten} scenes and jobs"
-            return (
-                f"What has become of {changed} could not be stored; it is tried again. {self._refusal or ''}".rstrip()
-            )
+            waits = f"What has become of {changed} could not be stored; it is tried again."
+            return waits if self._refusal is None else f"{waits} {self._refusal}"
         return self._refusal
 
     @property
