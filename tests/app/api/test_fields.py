@@ -140,7 +140,6 @@ def test_a_cancelled_training_leaves_nothing(service, services):
         ("table", {"mesh": GELATIN}, "another one"),
         ("sets", {"mesh": GELATIN}, "another one"),
         ("a", {"mesh": "teapot"}, "teapot"),
-        ("a", {"mesh": "025_mug"}, "osf assets fetch"),
         ("a", {"set": "none"}, "no such image set"),
         ("a", {"set": "../../x"}, "no such image set"),
         ("a", {}, "either mesh or set"),

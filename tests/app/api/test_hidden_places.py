@@ -9,10 +9,10 @@ from app.storage.database import CannotStore
 from osfcore.errors import CannotWrite, CorruptFile
 from tests.app.api.test_events import Stream
 from tests.app.api.test_problems import is_problem
-from tests.app.conftest import running, until
+from tests.app.conftest import keep_busy, running, until
 from tests.app.services.goals.test_goals import photo
 
-BOX = "003_cracker_box"
+BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
 PNG = {"Content-Type": "image/png"}
 
 
@@ -22,10 +22,14 @@ def blocked(library, tmp_path_factory):
     data_dir = tmp_path_factory.mktemp("machine") / "data"
     with running(library, data_dir) as client:
         (data_dir / "goals").write_text("")
-        for mesh in (data_dir / "objects" / BOX).glob("*.npz"):
-            mesh.unlink()  # a link to the same file of other tests
-            mesh.write_bytes(b"damaged")
+        damage(data_dir, BOX)
         yield client
+
+
+def damage(data_dir, name):
+    for mesh in (data_dir / "objects" / name).glob("*.npz"):
+        mesh.unlink()  # a link to the same file of other tests
+        mesh.write_bytes(b"damaged")
 
 
 def hides(client, text):
@@ -47,13 +51,16 @@ def test_a_file_that_is_damaged_is_named_from_the_data_directory_on(blocked):
 
 
 def test_what_a_job_failed_of_is_named_from_the_data_directory_on(blocked):
-    job = blocked.post("/api/jobs", json={"kind": "collect_object", "params": {"name": BOX, "images": 60}}).json()
+    busy = keep_busy(blocked)
+    job = blocked.post("/api/jobs", json={"kind": "collect_object", "params": {"name": BOTTLE, "images": 60}}).json()
+    damage(blocked.app.state.services.settings.data_dir, BOTTLE)
+    blocked.delete(f"/api/jobs/{busy}")
     address = f"/api/jobs/{job['id']}"
     until(lambda: blocked.get(address).json()["state"] == "failed")
-    assert blocked.get(address).json()["error"].startswith(f"objects/{BOX}")
+    assert blocked.get(address).json()["error"].startswith(f"objects/{BOTTLE}")
     assert hides(blocked, blocked.get(address).text + blocked.get("/api/jobs").text)
     replayed = blocked.app.state.services.store.events_after(0)
-    assert f"objects/{BOX}" in json.dumps(replayed)
+    assert f"objects/{BOTTLE}" in json.dumps(replayed)
     assert hides(blocked, json.dumps(replayed))
 
 

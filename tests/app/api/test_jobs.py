@@ -76,7 +76,6 @@ def test_one_runs_the_rest_wait_with_their_places(service, services):
     [
         ({"kind": "dance"}, "kind"),
         ({"kind": "collect_object", "params": {"name": "teapot"}}, "teapot"),
-        ({"kind": "collect_object", "params": {"name": "025_mug"}}, "osf assets fetch"),
         ({"kind": "collect_object", "params": {"name": "006_mustard_bottle", "images": 10}}, "images"),
         ({"kind": "collect_pushes", "params": {"objects": 8}}, "at most 5"),
         ({"kind": "fetch_assets", "params": {"names": ["teapot"]}}, "teapot"),

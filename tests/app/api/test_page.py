@@ -139,7 +139,7 @@ def test_what_cannot_be_made_is_told_and_leaves_nothing(service, services, monke
     is_problem(service.post("/api/presets/seventh"), 404)
     missing = next(one for one in PRESETS if set(one.objects) - set(services.objects.names()))
     before = service.get("/api/scenes").json()
-    assert "osf assets fetch" in is_problem(service.post(f"/api/presets/{missing.id}"), 422)["detail"]
+    assert "osf assets fetch" in is_problem(service.post(f"/api/presets/{missing.id}"), 409)["detail"]
 
     def refuse(*_):
         raise OsfError("There is no room.")

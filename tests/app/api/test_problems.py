@@ -140,3 +140,17 @@ def test_pointers_name_what_is_wrong(service):
     assert [error["pointer"] for error in errors] == ["#/params/seed"]
     wrong = is_problem(service.get("/api/scenes/x/images/0.png?size=7"), 422)["errors"]
     assert wrong[0]["parameter"] == "size"
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("scenes", {"objects": ["025_mug"]}),
+        ("jobs", {"kind": "collect_object", "params": {"name": "025_mug"}}),
+        ("jobs", {"kind": "train_field", "params": {"name": "a", "source": {"mesh": "025_mug"}}}),
+    ],
+)
+def test_an_object_that_was_not_fetched_is_a_conflict_in_words(service, path, body):
+    before = service.get(f"/api/{path}").json()
+    assert "osf assets fetch" in is_problem(service.post(f"/api/{path}", json=body), 409)["detail"]
+    assert service.get(f"/api/{path}").json() == before

@@ -75,7 +75,6 @@ def test_a_new_scene_is_shown_and_can_be_left_again(service, scene):
     ("body", "words"),
     [
         ({"objects": ["teapot"]}, "teapot"),
-        ({"objects": ["025_mug"]}, "osf assets fetch"),
         ({"objects": [BOX, BOX]}, "without repetition"),
         ({"objects": [BOX], "poses": [{"name": BOTTLE, "position": [0, 0, 0.1], "quaternion": UPRIGHT}]}, "poses"),
         ({"light": {"position": [1, 0, -0.5]}}, "elevation"),
