@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import ipaddress
 import logging
+import os
 import secrets
+import signal
 import socket
 import sys
 import time
@@ -65,8 +67,12 @@ class Serve(DataCommand):
             url = _url(self.host, listener.getsockname()[1])
             settings, login = _settings(self)
             start_log(self.data_dir)
-            with suppress(KeyboardInterrupt):  # the server raises it again once everything has stopped
-                _server(settings, url + login).run(sockets=[listener])
+            server = _server(settings, url + login)
+            # The server has a handler of its own, and raises the signal again once everything has stopped.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            # A terminal that closes asks for the same as `kill`.
+            signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
+            server.run(sockets=[listener])
         return {"url": url}
 
 
@@ -141,6 +147,7 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
 
     from app.api.app_factory import create_app
     from app.api.guards.connection_timeouts import PromptProtocol
+    from app.processes.child_process import end_children
 
     app = create_app(settings)
 
@@ -151,6 +158,9 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
                 _print_address(app, url)
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            if self.should_exit:  # who asks twice does not want to wait for anything
+                end_children()
+                os._exit(128 + sig)
             services = getattr(app.state, "services", None)
             if services is not None:
                 services.begin_closing()

@@ -9,6 +9,7 @@ import socket
 import sqlite3
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -89,21 +90,54 @@ def test_it_tells_one_address_and_leaves_at_once_with_streams_open(serve, data_d
     stream.close()
 
 
+def children(process):
+    """Process ids of the children of all threads of a process."""
+    lists = Path(f"/proc/{process.pid}/task").glob("*/children")
+    return [int(pid) for file in lists for pid in file.read_text().split()]
+
+
 @pytest.mark.slow
-def test_a_killed_service_leaves_no_process_and_can_start_again(serve, data_dir):
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGHUP])
+def test_a_killed_service_leaves_no_process_and_can_start_again(serve, data_dir, sent):
     process = serve(data_dir)
     address(process)
-
-    def children():
-        lists = Path(f"/proc/{process.pid}/task").glob("*/children")  # one for each thread
-        return [int(pid) for file in lists for pid in file.read_text().split()]
-
-    born = until(children)
-    process.kill()
+    born = until(lambda: children(process))
+    process.send_signal(sent)
     process.wait()
     until(lambda: not any(is_running(pid) for pid in born))
     again = serve(data_dir)
     assert get(address(again), "/api/health") == 200
+
+
+@pytest.mark.slow
+def test_a_second_interrupt_ends_it_and_its_job_at_once(serve, data_dir):
+    process = serve(data_dir)
+    port = address(process)
+    order = {"kind": "collect_table", "params": {"images": 5000, "size": 16}}
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=60)) as connection:
+        connection.request("POST", "/api/jobs", json.dumps(order), {"Content-Type": "application/json"})
+        response = connection.getresponse()
+        job = json.loads(response.read())["id"]
+        assert response.status == 202
+
+        def is_running_now():
+            connection.request("GET", f"/api/jobs/{job}")
+            return json.loads(connection.getresponse().read())["done"] > 0
+
+        until(is_running_now)
+    born = children(process)
+
+    def has_ended():
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.05)  # several at once would count as one
+        return process.poll() is not None
+
+    until(has_ended)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode in (130, 0)  # it may have stopped before the second one came
+    assert "Traceback" not in err
+    until(lambda: not any(is_running(pid) for pid in born))
+    assert get(address(serve(data_dir)), "/api/health") == 200
 
 
 def garbage(port):
