@@ -94,6 +94,19 @@ def test_a_photo_is_kept_with_what_its_file_tells(service):
     refuses(service.get(f"/api/photos/{photo['id']}"), 404, "no such photo")
 
 
+def test_a_damaged_photo_is_listed_as_such_until_it_is_deleted(service, services):
+    folder = services.settings.data_dir / "photos" / "broken"
+    folder.mkdir(parents=True)
+    (folder / "photo.json").write_text("{")
+    listed = service.get("/api/photos").json()
+    assert [each["id"] for each in listed["damaged"]] == ["broken"]
+    assert "broken" not in [photo["id"] for photo in listed["photos"]]
+    assert "delete it" in is_problem(service.get("/api/photos/broken"), 409)["detail"]
+    assert service.delete("/api/photos/broken").status_code == 204
+    assert service.get("/api/photos").json()["damaged"] == []
+    is_problem(service.delete("/api/photos/broken"), 404)
+
+
 def test_the_board_can_be_printed(service):
     answer = service.get("/api/photos/board.pdf")
     assert answer.headers["content-type"] == "application/pdf"
