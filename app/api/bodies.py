@@ -26,7 +26,7 @@ from app.api.problems import NotFound, too_large
 
 JSON = "application/json"
 SMALL_BODY_BYTES = 256 << 10  # of JSON that describes a scene, a goal or an order
-MAX_MEMBERS = 100  # of one JSON object: each unknown one is a mistake that is told, at some cost
+MAX_MEMBERS = 100  # of one JSON object: each unknown one is a mistake to report, at some cost
 Model = TypeVar("Model", bound=Input)
 
 
@@ -101,7 +101,7 @@ def parsed(model: type[Model], body: bytes) -> Model:
         RequestValidationError: as FastAPI does for a body that it reads itself.
         HTTPException: if an object in it has too many members.
     """
-    with contextlib.suppress(ValueError, RecursionError):  # told in the words of the model
+    with contextlib.suppress(ValueError, RecursionError):  # the model says so in its own words
         bounded_json(body)
     try:
         return model.model_validate_json(body)

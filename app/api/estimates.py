@@ -109,9 +109,9 @@ class EstimateOut(ProgressOut):
 
         Args:
             job: of the kind "estimate".
-            steps: as `read_steps` tells them; none where they are not asked for.
+            steps: as from `read_steps`; none where they are not asked for.
             estimate: the result; None before it is there, or where it is not asked for.
-            errors: against the truth, as `errors_of` tells them; None where nobody knows it.
+            errors: against the truth, as from `errors_of`; None where nobody knows it.
         """
         return EstimateOut(
             **progress_of(job),

@@ -131,7 +131,7 @@ class DepartureMiddleware:
 
 
 class Mailbox:
-    """What one page has not been told yet: all jobs and notices, but only the latest scene and images."""
+    """What has not been sent to one page yet: all jobs and notices, but only the latest scene and images."""
 
     def __init__(self, current: str | None) -> None:
         self._loop = asyncio.get_running_loop()
@@ -325,7 +325,7 @@ def _forgotten(number: int, job: str) -> ServerSentEvent:
 
 
 def _replayed(services: Services, number: int, fields: dict[str, Any]) -> ServerSentEvent | None:
-    """An event as it was told; None if another version wrote it in a way that makes no sense to this one.
+    """An event as it was sent; None if another version wrote it in a way that makes no sense to this one.
 
     Args:
         services: of the app.

@@ -237,8 +237,8 @@ async def create(
         body = parsed(GoalIn, await whole_body(request, SMALL_BODY_BYTES))
         record = await services.lanes.slow.run(_made, services, body)
     else:
-        told = "Send a photo, such as a JPEG or PNG file, or JSON that says how the objects lie."
-        raise HTTPException(415, told)
+        advice = "Send a photo, such as a JPEG or PNG file, or JSON that says how the objects lie."
+        raise HTTPException(415, advice)
     response.headers["Location"] = f"{UPLOAD_PATH}/{record.id}"
     return GoalOut.of(record)
 

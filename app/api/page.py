@@ -192,9 +192,9 @@ class StoryList(BaseModel):
 def list_stories() -> StoryList:
     """List the stories, in the order in which the page plays them."""
     stories = Stories()
-    told = [stories.told(name) for name in stories.names()]
-    told.sort(key=lambda story: _ORDER.index(story["name"]) if story["name"] in _ORDER else len(_ORDER))
-    return StoryList(stories=[StoryOut.model_validate({**story, **_pictures(story["name"])}) for story in told])
+    listed = [stories.told(name) for name in stories.names()]
+    listed.sort(key=lambda story: _ORDER.index(story["name"]) if story["name"] in _ORDER else len(_ORDER))
+    return StoryList(stories=[StoryOut.model_validate({**story, **_pictures(story["name"])}) for story in listed])
 
 
 def _pictures(name: str) -> dict[str, str]:

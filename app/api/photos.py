@@ -280,7 +280,7 @@ class GoalMadeOut(TableMadeOut):
 
 
 def facts_of(photo: TablePhoto) -> PhotoFacts:
-    """What a list tells of a photo."""
+    """What a list says of a photo."""
     return PhotoFacts(
         id=photo.id,
         name=photo.name,

@@ -34,13 +34,13 @@ _STATE_EXAMPLE = {
 }
 
 
-class Told(BaseModel):
-    """Part of a file or answer that tells more than is needed here; the rest is left alone."""
+class Excerpt(BaseModel):
+    """Part of a file or answer that holds more than is needed here; the rest is left alone."""
 
     model_config = ConfigDict(extra="ignore", strict=True)
 
 
-class PlacedObject(Told):
+class PlacedObject(Excerpt):
     """Where one object is."""
 
     name: ObjectName
@@ -48,13 +48,13 @@ class PlacedObject(Told):
     quaternion: Quaternion
 
 
-class Place(Told):
+class Place(Excerpt):
     """A place in the world."""
 
     position: Position
 
 
-class StateIn(Told):
+class StateIn(Excerpt):
     """Where everything is: what scene.json, state.json and /api/scenes tell can be sent as it is."""
 
     objects: list[PlacedObject] = Field(min_length=1, max_length=MAX_OBJECTS)

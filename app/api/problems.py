@@ -83,8 +83,8 @@ class Problem(BaseModel):
     errors: list[ProblemPointer] | None = None
 
 
-_MOST_POINTERS = 20  # mistakes that are told of one request
-_LONGEST_TOLD = 1e9  # numbers below this are repeated in a sentence
+_MOST_POINTERS = 20  # mistakes that are listed of one request
+_LARGEST_SHOWN = 1e9  # numbers below this are repeated in a sentence
 _WORDS = {  # title of each problem, and when routes answer it
     400: ("Bad request", "The request cannot be read."),
     401: ("Token needed", "The service needs a token."),
@@ -177,7 +177,7 @@ def status_of(error: OsfError) -> int:
 
 
 def install(app: FastAPI) -> None:
-    """Make the app answer every error as a problem; `app.state.settings` tells which places no sentence may name."""
+    """Make the app answer every error as a problem; `app.state.settings` says which places no sentence may name."""
     app.add_exception_handler(OsfError, _on_osf_error)
     app.add_exception_handler(HTTPException, _on_http_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
@@ -253,7 +253,7 @@ _MUST = {
     "list_type": "must be a list",
     "literal_error": "must be {expected}",
     "extra_forbidden": "is not known here",
-}  # of the kinds of mistakes that pydantic tells
+}  # of the kinds of mistakes that pydantic finds
 
 
 def _sentence(entry: Mapping[str, Any]) -> str:
@@ -264,8 +264,8 @@ def _sentence(entry: Mapping[str, Any]) -> str:
     if must is None:
         return f"{subject} cannot be used: {str(entry['msg']).encode('utf-8', 'replace').decode('utf-8')}."
     value = entry.get("input")
-    is_told = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LONGEST_TOLD
-    now = f" is {value:g}, but it" if is_told and must.startswith("must") else ""
+    is_shown = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGEST_SHOWN
+    now = f" is {value:g}, but it" if is_shown and must.startswith("must") else ""
     return f"{subject}{now} {must.format(**entry.get('ctx', {}))}."
 
 

@@ -107,7 +107,7 @@ class SceneOut(BaseModel):
         )
 
 
-@cache  # every scene tells its cameras
+@cache  # every answer about a scene lists its cameras
 def _cameras(size: int) -> list[CameraJson]:
     return [CameraJson.of(camera) for camera in (*default_cameras(size), goal_camera(size))]
 

@@ -69,7 +69,7 @@ class Metrics:
         )  # fmt: skip
 
     def watch(self, runner: Runner) -> None:
-        """Also tell about scenes and jobs from now on."""
+        """Also count scenes and jobs from now on."""
         self._registry.register(_State(runner))
 
     def answered(self, method: str, status: int, seconds: float) -> None:

@@ -67,7 +67,7 @@ def is_same_origin(connection: HTTPConnection, allowed: Iterable[str] = ()) -> b
 
 
 class BodyLimitMiddleware:
-    """Refuses requests larger than what `limit_of` tells for their path [bytes]."""
+    """Refuses requests larger than what `limit_of` returns for their path [bytes]."""
 
     def __init__(self, app: ASGIApp, *, limit_of: Callable[[str], int]) -> None:
         self._app = app

@@ -28,7 +28,7 @@ class RateLimit:
     Args:
         rate: tokens that come back [1/s].
         burst: tokens at most.
-        clock: tells the time [s].
+        clock: the time, as a function [s].
     """
 
     def __init__(self, rate: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
