@@ -340,10 +340,10 @@ def test_people_are_told_what_was_found_and_what_would_help(photos, tmp_path, ca
 @pytest.mark.slow
 def test_what_does_not_suffice_is_refused(photos, tmp_path, capsys):
     out = ["--out", str(tmp_path / "camera.json")]
-    assert "number of photos of the board is 2" in refused(capsys, *photos[:2], *out)
+    assert "number of photos of the board is 2" in refused(capsys, *photos[:2], *out, code=1)
     above = Camera.look_at("above", (0.0, 0.0, 0.5), (0.0, 0.0, 0.0)).T_world_camera
     frontal = [written(tmp_path, f"above{n}.png", above, 10 + n) for n in range(3)]
-    assert "do not tell focal length from distance; in the next, " in refused(capsys, *frontal, *out)
+    assert "do not tell focal length from distance; in the next, " in refused(capsys, *frontal, *out, code=1)
     write_png(tmp_path / "wall.png", np.full((480, 640, 3), 120, np.uint8))
     assert "wall.png cannot be used: " in refused(capsys, *photos[:3], str(tmp_path / "wall.png"), *out, code=1)
     assert "a path that ends in .json" in refused(capsys, *photos, "--out", str(tmp_path / "camera.txt"))
