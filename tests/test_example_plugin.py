@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.episodes.part_names import PartNames, parts_of
-from app.episodes.request import EpisodeOrder, given
+from app.episodes.record import PartNames
+from app.episodes.request import EpisodeOrder, given, parts_of
 from osfcore.control.estimators import ESTIMATOR
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.cameras import goal_camera

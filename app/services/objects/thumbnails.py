@@ -6,8 +6,8 @@ import contextlib
 import threading
 from pathlib import Path
 
-from app.processes.pictures.thumbnail_process import thumbnails_main
-from app.processes.process_client import ProcessClient, ProcessUnavailable
+from app.processes.client import ProcessClient, ProcessUnavailable
+from app.processes.thumbnail_process import thumbnails_main
 from osfcore.errors import CannotWrite
 from osfcore.io.files import write_atomically
 from osfcore.objects.asset_library import AssetLibrary
