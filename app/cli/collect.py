@@ -3,45 +3,58 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand, Flat, follow
+from app.cli.command import Command, DataCommand, follow, settings_of
 from app.cli.workers import worker_pool
-from osfcore.world.collect_images import (
-    CollectObject,
-    CollectObservation,
-    CollectTable,
-    collect_object,
-    collect_observation,
-    collect_table,
-)
-from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 
 _IN_FLIGHT = 64  # episodes that a cluster is given at once
 
 
 @dataclass(frozen=True)
-class CollectObjectCommand(DataCommand, CollectObject):
+class CollectObjectCommand(DataCommand):
     """Images of one object from all sides under lights from all directions, in the OSF format."""
 
     name: tyro.conf.Positional[str]
     """Name of the object, such as 006_mustard_bottle."""
+    out: Path
+    """Folder to write; must be new or empty."""
+    images: int = 300
+    """Train and test images together; one in eight, at least 40, are for testing."""
+    size: int = 128
+    """Side of the square images [px]."""
+    seed: int = 0
+    """Of views and lights."""
 
     def run(self) -> dict[str, Any]:
         """Collect; the result names the folder and the counts."""
-        last = follow(collect_object(self, self.assets))
+        from osfcore.world.collect_images import CollectObject, collect_object
+
+        last = follow(collect_object(settings_of(CollectObject, self), self.assets))
         return {"out": str(self.out), "images": last.total if last else 0}
 
 
 @dataclass(frozen=True)
-class CollectTableCommand(Command, CollectTable):
+class CollectTableCommand(Command):
     """Images of the bare table under many lights, in the OSF format."""
+
+    out: Path
+    """Folder to write; must be new or empty."""
+    images: int = 300
+    """Train and test images together; one in eight, at least 40, are for testing."""
+    size: int = 128
+    """Side of the square images [px]."""
+    seed: int = 0
+    """Of views and lights."""
 
     def run(self) -> dict[str, Any]:
         """Collect; the result names the folder and the counts."""
-        last = follow(collect_table(self))
+        from osfcore.world.collect_images import CollectTable, collect_table
+
+        last = follow(collect_table(settings_of(CollectTable, self)))
         return {"out": str(self.out), "images": last.total if last else 0}
 
 
@@ -49,7 +62,32 @@ class CollectTableCommand(Command, CollectTable):
 class CollectPushesCommand(DataCommand):
     """Episodes of pushes for learning dynamics. A killed collection goes on where it was when started again."""
 
-    settings: Flat[CollectPushes]
+    out: Path
+    """HDF5 file to write; must be new."""
+    episodes: int = 1000
+    """Number of episodes."""
+    steps: int = 50
+    """Actions of 0.2 s per episode."""
+    objects: int = 3
+    """Objects per scene, chosen at random among those fetched."""
+    policy: Literal["paper", "directed"] = "paper"
+    """Uniform random velocities, or a pusher that seeks sustained contact."""
+    seed: int = 0
+    """Of everything."""
+    images: bool = False
+    """Keep frames of one camera as well, with the pusher in them."""
+    camera: Literal["0", "goal"] = "0"
+    """What takes the frames: camera 0, or the one that takes goal images."""
+    size: int = 128
+    """Side of the frames [px]."""
+    random_lights: bool = False
+    """Frames under one light per episode from the whole hemisphere."""
+    renderer: Literal["embree", "tiny"] = "embree"
+    """What takes the frames: exact ray tracing, or PyBullet's TinyRenderer."""
+    names: tuple[str, ...] | None = None
+    """Objects to choose from; by default all that were fetched."""
+    disturb: int = 0
+    """From how many slightly disturbed states to simulate each quarter of an action in which something moves."""
     workers: int = 2
     """Processes that simulate side by side; the content does not depend on it."""
     cluster: str | None = None
@@ -57,7 +95,9 @@ class CollectPushesCommand(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Collect; the result has the shares of steps with contact and motion, and the rate."""
-        settings = self.settings
+        from osfcore.world.collect_pushes import CollectPushes, collect_pushes
+
+        settings = settings_of(CollectPushes, self)
         in_flight = self.workers + 2 if self.cluster is None else _IN_FLIGHT
         with worker_pool(self.workers, self.cluster) as executor:
             last = follow(collect_pushes(settings, self.assets, executor, in_flight))
@@ -72,12 +112,28 @@ class CollectPushesCommand(DataCommand):
 
 
 @dataclass(frozen=True)
-class CollectObservationCommand(DataCommand, CollectObservation):
+class CollectObservationCommand(DataCommand):
     """One observation of a random scene, to try 'osf estimate' with; truth.json in it has what was there."""
+
+    out: Path
+    """Folder to write; must be new or empty."""
+    names: tuple[str, ...] | None = None
+    """Names of the objects; by default a random choice among those with a field."""
+    objects: int = 3
+    """How many objects, where no names are given."""
+    seed: int = 0
+    """Of objects, places and light."""
+    size: int = 128
+    """Side of the square images [px]."""
+    goal: bool = False
+    """Only the goal camera's view, without pusher and masks."""
 
     def run(self) -> dict[str, Any]:
         """Collect; the result names the folder and what is to be seen."""
-        made = collect_observation(self, self.assets, self.trained.names())
+        from osfcore.world.collect_images import CollectObservation, collect_observation
+
+        settings = settings_of(CollectObservation, self)
+        made = collect_observation(settings, self.assets, self.trained.names())
         views = "1 view" if len(made.cameras) == 1 else f"{len(made.cameras)} views"
         self.say(f"Wrote {self.out}: {views} of {', '.join(made.names)}.")
         return {"out": str(self.out), "objects": list(made.names), "cameras": [c.name for c in made.cameras]}

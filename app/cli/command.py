@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 
@@ -177,3 +177,12 @@ def show_table(rows: Iterable[Iterable[str]], titles: Iterable[str], left: Itera
     for row in rows:
         table.add_row(*map(escape, row))
     Console().print(table)
+
+
+def settings_of(kind: type[T], command: object) -> T:
+    """Return settings of the core from the options of a command that have the names of their fields.
+
+    Commands whose settings stand in a module that loads torch or a simulator state the options once more: taken from
+    there, they would load it for every help page.
+    """
+    return kind(**{field.name: getattr(command, field.name) for field in fields(kind)})  # pyright: ignore[reportArgumentType]

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand, Device, Flat, follow
+from app.cli.command import Command, DataCommand, Device, follow, settings_of
 from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput
-from osfcore.experiments.rivals.train_fitvid import TrainFitVid, train_fitvid
 from osfcore.io.output_paths import SUFFIX
 
 if TYPE_CHECKING:
@@ -202,12 +201,42 @@ class TrainDynamicsCommand(DataCommand):
 class TrainFitVidCommand(Command):
     """FitVid, which predicts video, to compare with. A killed training goes on when started again."""
 
-    settings: Flat[TrainFitVid]
+    data: tuple[Path, ...]
+    """Push files with frames, as 'osf collect pushes --images --camera goal --random-lights' writes them."""
+    out: Path
+    """File to write, such as fitvid.safetensors; its metrics go beside it as .json."""
+    minutes: float = 60.0
+    """How long to train [min]."""
+    iterations: int | None = None
+    """Instead of a time budget: that many steps of descent, repeatable on one machine."""
+    width: int = 4
+    """Channels at full size; they double whenever the image is halved."""
+    batch: int = 8
+    """Windows in each step of descent."""
+    frames: int = 12
+    """Frames of a window, of which two are given."""
+    rate: float = 1e-3
+    """Of learning."""
+    beta: float = 1e-4
+    """Weight of the KL divergence."""
+    augment: bool = True
+    """Vary crops and colours."""
+    precision: Literal["bfloat16", "float32"] = "bfloat16"
+    """What convolutions compute in while training."""
+    save_every: int = 20
+    """Steps between checkpoints."""
+    measured: int = 32
+    """Held-out videos to measure on in the end, at most."""
+    device: Device = "auto"
+    seed: int = 0
+    """Of everything random."""
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result holds the metrics."""
-        out = self.settings.out
-        follow(train_fitvid(self.settings))
+        from osfcore.experiments.rivals.train_fitvid import TrainFitVid, train_fitvid
+
+        follow(train_fitvid(settings_of(TrainFitVid, self)))
+        out = self.out
         metrics = _metrics(out)
         for horizon, means in metrics["horizons"].items():
             psnr = f"{means['psnr']:.1f} dB (the last known frame, copied: {means['psnr_copied']:.1f} dB)"

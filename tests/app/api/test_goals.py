@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from app.storage.records import GoalRecord
 from PIL import Image
 from pydantic import ValidationError
 
@@ -12,6 +11,7 @@ from app.api.app_factory import create_app
 from app.api.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalOut
 from app.services.goals.goals import Draft
 from app.services.service_settings import Settings
+from app.storage.records import GoalRecord
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import MAX_OBJECTS

@@ -25,8 +25,8 @@ def test_table_images(tmp_path):
 
 def test_pushes_tell_their_shares(data_dir, tmp_path):
     out = tmp_path / "pushes.h5"
-    settings = CollectPushes(out, episodes=3, steps=10, policy="directed")
-    result = CollectPushesCommand(settings, workers=1, data_dir=data_dir).run()
+    command = CollectPushesCommand(out, episodes=3, steps=10, policy="directed", workers=1, data_dir=data_dir)
+    result = command.run()
     assert check_path(out).facts == {"episodes": 3, "steps": 30}
     assert 0 <= result["contact_share"] <= 1
     assert 0 <= result["motion_share"] <= 1
@@ -35,8 +35,8 @@ def test_pushes_tell_their_shares(data_dir, tmp_path):
 
 def test_frames_of_the_goal_camera_go_along_with_pushes(data_dir, tmp_path):
     out = tmp_path / "pushes.h5"
-    settings = CollectPushes(out, episodes=1, steps=2, images=True, camera="goal", size=16, random_lights=True)
-    CollectPushesCommand(settings, workers=1, data_dir=data_dir).run()
+    frames = {"images": True, "camera": "goal", "size": 16, "random_lights": True}
+    CollectPushesCommand(out, episodes=1, steps=2, workers=1, data_dir=data_dir, **frames).run()
     (episode,) = read_pushes(out)
     assert episode.frames is not None
     assert episode.frames.shape == (3, 16, 16, 3)
