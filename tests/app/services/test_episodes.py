@@ -37,7 +37,7 @@ from osfcore.control.events import EpisodeSettings
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
-from osfcore.io.image_file import write_png
+from osfcore.io.image_file import encode_png, write_png
 from osfcore.io.scene_file import Scene, scene_to_json
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import until
@@ -47,7 +47,7 @@ from tests.support.errors import about
 POSES = tuple(
     (name, Pose(np.array([x, 0.0, 0.05]), np.array([1.0, 0, 0, 0]))) for name, x in ((BOX, 0), (MUSTARD, 0.2))
 )
-PNG = b"\x89PNG picture"
+PNG = encode_png(np.zeros((2, 2, 3), np.uint8))
 
 
 class ChangingJobs(Jobs):
