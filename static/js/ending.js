@@ -71,7 +71,7 @@ function goOn(changes) {
 }
 
 export function setUpEnding() {
-  watch("scene", () => { if (shown) drawEnding(shown); });
+  for (const what of ["scene", "objects"]) watch(what, () => { if (shown) drawEnding(shown); });
   byId("more-pushes").addEventListener("click", () => goOn({ steps: MORE }));
   byId("go-on-anyway").addEventListener("click", () => goOn({ despite_doubts: true }));
   byId("another-photo").addEventListener("click", () => {

@@ -415,4 +415,5 @@ def test_what_is_missing_is_told_by_the_rule_that_an_episode_goes_by(page, servi
     page.wait_for_selector("#ending-rule:has-text('within 8 mm and 3.4°')", timeout=WAIT_MS)
     assert page.inner_text("#ending-sum").startswith("6.0 cm to 9.0 mm, 0 pushes, 31 s")
     label = next(o["label"] for o in service.call("GET", "objects")["objects"] if o["name"] == one)
-    assert page.inner_text("#ending-why") == f"{label} is still 9.0 mm away and turned by 3.5°."
+    missing = f"{label} is still 9.0 mm away and turned by 3.5°."
+    page.wait_for_selector(f"#ending-why:text-is('{missing}')", timeout=WAIT_MS)
