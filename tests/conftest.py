@@ -3,6 +3,7 @@
 import hashlib
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,8 @@ from tests.kernels import compile_kernels
 
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as the command line does, before torch comes in
 os.environ.setdefault("OSF_STANDBY", "0")  # a process in reserve would take time from tests that need none
+# A shell lets what it runs in the background ignore Ctrl-C; commands that tests interrupt would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 # Timing lives in benchmarks: a busy machine is no failure.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")

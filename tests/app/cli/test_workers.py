@@ -3,7 +3,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from osfcore.fields.train_kiloosf import TrainField, train_field
 from osfcore.fields.train_several import train_several
 from osfcore.io.push_file import read_pushes
 from osfcore.world.collect_pushes import CollectPushes, collect_pushes
+from tests.app.conftest import until
 from tests.clusters import deadly, local_cluster, number_of, number_that_kills, training_that_dies
 from tests.support.errors import about
 from tests.support.rendered_sets import QUICK, painted_ball, painted_block, write_object_set
@@ -53,10 +53,7 @@ def test_workers_end_with_a_killed_parent(tmp_path):
     parent.kill()
     parent.wait()
     parent.stdout.close()
-    deadline = time.monotonic() + 10
-    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not Path(f"/proc/{worker}").exists()
+    until(lambda: not Path(f"/proc/{worker}").exists())
 
 
 INTERRUPTED = """
