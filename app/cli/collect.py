@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand, follow, settings_of
+from app.cli.command import Command, DataCommand, follow, options_as
 from app.cli.workers import worker_pool
 
 _IN_FLIGHT = 64  # episodes that a cluster is given at once
@@ -33,7 +33,7 @@ class CollectObjectCommand(DataCommand):
         """Collect; the result names the folder and the counts."""
         from osfcore.world.collect_images import CollectObject, collect_object
 
-        last = follow(collect_object(settings_of(CollectObject, self), self.assets))
+        last = follow(collect_object(options_as(CollectObject, self), self.assets))
         return {"out": str(self.out), "images": last.total if last else 0}
 
 
@@ -54,7 +54,7 @@ class CollectTableCommand(Command):
         """Collect; the result names the folder and the counts."""
         from osfcore.world.collect_images import CollectTable, collect_table
 
-        last = follow(collect_table(settings_of(CollectTable, self)))
+        last = follow(collect_table(options_as(CollectTable, self)))
         return {"out": str(self.out), "images": last.total if last else 0}
 
 
@@ -97,7 +97,7 @@ class CollectPushesCommand(DataCommand):
         """Collect; the result has the shares of steps with contact and motion, and the rate."""
         from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 
-        settings = settings_of(CollectPushes, self)
+        settings = options_as(CollectPushes, self)
         in_flight = self.workers + 2 if self.cluster is None else _IN_FLIGHT
         with worker_pool(self.workers, self.cluster) as executor:
             last = follow(collect_pushes(settings, self.assets, executor, in_flight))
@@ -132,7 +132,7 @@ class CollectObservationCommand(DataCommand):
         """Collect; the result names the folder and what is to be seen."""
         from osfcore.world.collect_images import CollectObservation, collect_observation
 
-        settings = settings_of(CollectObservation, self)
+        settings = options_as(CollectObservation, self)
         made = collect_observation(settings, self.assets, self.trained.names())
         views = "1 view" if len(made.cameras) == 1 else f"{len(made.cameras)} views"
         self.say(f"Wrote {self.out}: {views} of {', '.join(made.names)}.")

@@ -179,7 +179,7 @@ def show_table(rows: Iterable[Iterable[str]], titles: Iterable[str], left: Itera
     Console().print(table)
 
 
-def settings_of(kind: type[T], command: object) -> T:
+def options_as(kind: type[T], command: object) -> T:
     """Return settings of the core from the options of a command that have the names of their fields.
 
     Commands whose settings stand in a module that loads torch or a simulator state the options once more: taken from

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand, Device, follow, settings_of
+from app.cli.command import Command, DataCommand, Device, follow, options_as
 from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput
 from osfcore.io.output_paths import SUFFIX
@@ -235,7 +235,7 @@ class TrainFitVidCommand(Command):
         """Train with a progress bar; the result holds the metrics."""
         from osfcore.experiments.rivals.train_fitvid import TrainFitVid, train_fitvid
 
-        follow(train_fitvid(settings_of(TrainFitVid, self)))
+        follow(train_fitvid(options_as(TrainFitVid, self)))
         out = self.out
         metrics = _metrics(out)
         for horizon, means in metrics["horizons"].items():
