@@ -21,23 +21,19 @@ from app.processes.client import ProcessBusy, ProcessClient
 from app.processes.predict_process import predictor_main
 from app.processes.render_process import renderer_main
 from app.services.disturber import Disturber
+from app.services.driver import GRACE_S, Driver
 from app.services.episodes import Episodes
 from app.services.estimates import Estimates
-from app.services.examples.presets import OPENING, preset
+from app.services.examples import OPENING, preset
 from app.services.fields import FieldCatalogue
-from app.services.goals.goal_checks import GoalChecks
-from app.services.goals.goals import Goals
-from app.services.objects.own_objects import OwnObjects
-from app.services.objects.thumbnails import Thumbnails
-from app.services.photos.board_photos import BoardPhotos
-from app.services.photos.photo_tables import PhotoTables
-from app.services.photos.table_photos import TablePhotos
-from app.services.predictions import Predictions
+from app.services.goals import GoalChecks, Goals
+from app.services.look_outlines import Outliner
+from app.services.objects import OwnObjects, Thumbnails
+from app.services.photos import BoardPhotos, PhotoTables, TablePhotos
+from app.services.pushes import Predictions
 from app.services.robot import RobotTable
 from app.services.runner import DemoScene, Runner
 from app.services.service_settings import Settings
-from app.services.visitors.driver import GRACE_S, Driver
-from app.services.visitors.look_outlines import Outliner
 from app.storage.database import Store
 from app.storage.photos import PhotoReader
 from app.viewer import Viewer

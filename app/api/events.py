@@ -28,10 +28,10 @@ from app.api.scenes import scene_out
 from app.jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
 from app.jobs.kinds import KINDS
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
+from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
-from app.services.goals.goals import DraftChanged, GoalsChanged
-from app.services.photos.table_photos import PhotosChanged
-from app.services.visitors.driver import DriverChanged
+from app.services.goals import DraftChanged, GoalsChanged
+from app.services.photos import PhotosChanged
 from app.storage.paths import without_places
 from osfcore.control.events import Looking
 from osfcore.errors import OsfError, UnknownName

@@ -28,8 +28,7 @@ from app.api.models import DisplayName, Identifier, Input, LightIn, ObjectCount,
 from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
 from app.api.problems import NotFound, named_in_path, problems
 from app.api.scenes import SceneObject
-from app.services.goals.goal_checks import GoalCheck, GoalVerdict
-from app.services.goals.goals import Draft, NoDraft
+from app.services.goals import Draft, GoalCheck, GoalVerdict, NoDraft
 from app.storage.photos import PhotoCrop
 from app.storage.records import GoalRecord, Source
 from osfcore.errors import InvalidInput, OsfError

@@ -13,8 +13,7 @@ from app.api.goals import GoalOut
 from app.api.models import Identifier, Input, Visitor
 from app.api.problems import named_in_path, problems
 from app.api.scenes import SceneOut, scene_out
-from app.services.examples.presets import PRESETS, preset, set_up
-from app.services.examples.stories import Stories
+from app.services.examples import PRESETS, Stories, preset, set_up
 from app.storage.paths import static_folder
 from app.viewer.page_views import Replay, Shows, Wish
 from osfcore.errors import InvalidInput

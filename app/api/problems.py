@@ -24,21 +24,19 @@ from app.processes.client import ProcessBusy, ProcessUnavailable
 from app.processes.photo_process import PhotoRefused
 from app.processes.server import InternalError, OutOfMemory
 from app.services.disturber import NoRoomToNudge
+from app.services.driver import NotDriving
 from app.services.episode_results import NoTrajectory
 from app.services.episodes import EpisodeGoesOn, GoalUnknown, NoGoal
 from app.services.estimates import NoImages, NoPrior, NoScene
 from app.services.fields import MissingFields, NoPublishedField, NoTrainedField, ShippedField
-from app.services.goals.goal_checks import GoalRefused
-from app.services.goals.goals import DraftUnsound, NoDraft, NoPhoto, NoTable
+from app.services.goals import DraftUnsound, GoalRefused, NoDraft, NoPhoto, NoTable
 from app.services.image_sets import TooManySets
-from app.services.objects.own_objects import CatalogueObject, ObjectNeeded, ObjectTaken
-from app.services.photos.photo_tables import PhotoDoubtful
-from app.services.photos.table_photos import NotFoundYet, NothingMarked
-from app.services.predictions import NothingToPush
+from app.services.objects import CatalogueObject, ObjectNeeded, ObjectTaken
+from app.services.photos import NotFoundYet, NothingMarked, PhotoDoubtful
+from app.services.pushes import NothingToPush
 from app.services.robot import NoPicture, NoRobot, NothingAsked, RobotBusy
 from app.services.runner import SceneNeeded, SetInUse, TrainingAlready, WorkshopInUse
 from app.services.scenes import SceneHeld, TooManyScenes
-from app.services.visitors.driver import NotDriving
 from app.storage.database import CannotStore
 from app.storage.paths import without_places
 from app.storage.records import TooManyGoals, TooManyPhotos

@@ -179,8 +179,8 @@ class Record(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Make them one after the other; return how each episode ended."""
-        from app.services.examples.presets import PRESETS, preset
-        from app.services.examples.story_recording import record_story
+        from app.services.examples import PRESETS, preset
+        from app.services.story_recording import record_story
 
         outcomes = {}
         for name in self.names or [one.id for one in PRESETS]:

@@ -14,10 +14,9 @@ from app.jobs.job import Job, JobPage
 from app.jobs.kinds.episodes import method_of, settings_of
 from app.processes.messages.scene_messages import ComposeGoal
 from app.services.episode_results import EpisodeResults
-from app.services.examples.stories import Stories
+from app.services.examples import Stories
 from app.services.fields import FieldCatalogue
-from app.services.goals.goal_checks import GoalChecks
-from app.services.goals.goals import GOAL_SIDE, Goals, NoTable
+from app.services.goals import GOAL_SIDE, GoalChecks, Goals, NoTable
 from app.services.runner import Runner
 from app.storage.database import CannotStore
 from app.storage.records import GoalRecord, Poses, poses_to_json

@@ -22,7 +22,7 @@ from app.jobs.kinds.robots import CameraPicture, read_picture
 from app.services.episodes import nested
 from app.services.event_hub import Notice
 from app.services.fields import FieldCatalogue
-from app.services.goals.goals import Goals
+from app.services.goals import Goals
 from app.services.runner import Runner
 from app.services.service_settings import Settings
 from app.storage.database import CannotStore

@@ -14,7 +14,7 @@ import viser
 from jaxtyping import Float
 
 from app.services.event_hub import CurrentScene
-from app.services.goals.goals import DraftChanged, Goals
+from app.services.goals import DraftChanged, Goals
 from app.viewer.drawing import Panel, RunCommand
 from app.viewer.nodes.episode_nodes import GOAL, add_copy
 from app.viewer.nodes.room import NO_TURN, atomic, put

@@ -17,7 +17,7 @@ from app.processes.messages.scene_messages import SceneChanged
 from app.processes.plan_summary import PlanSketch
 from app.services import episodes, estimates
 from app.services.event_hub import CurrentScene
-from app.services.goals.goals import DraftChanged
+from app.services.goals import DraftChanged
 from app.viewer.drawing import Panel
 from app.viewer.nodes.episode_nodes import EpisodeNodes, Part
 from app.viewer.nodes.estimate_nodes import EstimateNodes

@@ -20,8 +20,7 @@ from jaxtyping import Float
 from app.processes.messages.neural_messages import NeuralAnswer, Predicted
 from app.processes.messages.scene_messages import SceneChanged, SceneRecord
 from app.services.event_hub import CurrentScene
-from app.services.predictions import Predictions
-from app.services.pushes import MAX_ACTIONS, Outcome, along, outcomes, straight, toward_nearest, way
+from app.services.pushes import MAX_ACTIONS, Outcome, Predictions, along, outcomes, straight, toward_nearest, way
 from app.viewer.drawing import DrawingThread, Panel, RunCommand, status
 from app.viewer.nodes.push_nodes import FEWEST, MOST, PushNodes, Waypoints
 from app.viewer.nodes.scene_nodes import Client

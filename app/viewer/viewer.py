@@ -20,8 +20,8 @@ from app.jobs.job import JobChanged
 from app.processes.client import ProcessClient
 from app.processes.messages.scene_messages import SceneRecord
 from app.services.event_hub import CurrentScene
-from app.services.goals.goals import DraftChanged, Goals
-from app.services.predictions import Predictions
+from app.services.goals import DraftChanged, Goals
+from app.services.pushes import Predictions
 from app.services.runner import Runner
 from app.storage.paths import without_places
 from app.viewer.drawing import DrawingThread, Panel, Playback

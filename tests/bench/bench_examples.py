@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from app.services.examples.presets import PRESETS
+from app.services.examples import PRESETS
 from app.storage.paths import default_data_dir
 from tests.bench.bench_service import call
 from tests.bench.machine import machine

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.episodes.trajectory import read_trajectory
-from app.services.examples.stories import Stories
+from app.services.examples import Stories
 from tests.e2e.conftest import watch_errors
 from tests.e2e.test_episodes import until
 from tests.live import live_service

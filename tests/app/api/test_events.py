@@ -13,9 +13,9 @@ from PIL import Image
 
 from app.api.events import DepartureMiddleware, Mailbox
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
+from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
-from app.services.goals.goals import Draft, DraftChanged, GoalsChanged
-from app.services.visitors.driver import DriverChanged
+from app.services.goals import Draft, DraftChanged, GoalsChanged
 from tests.app.api.test_jobs import TABLE
 from tests.app.conftest import until
 from tests.app.storage.test_database import record

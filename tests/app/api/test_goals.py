@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from app.api.app_factory import create_app
 from app.api.goals import DraftIn, DraftKeep, DraftOut, DraftPatch, GoalIn, GoalOut
-from app.services.goals.goals import Draft
+from app.services.goals import Draft
 from app.services.service_settings import Settings
 from app.storage.records import GoalRecord
 from osfcore.geometry.cameras import goal_camera

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from app.services.examples.presets import PRESETS, preset
+from app.services.examples import PRESETS, preset
 from osfcore.errors import OsfError
 from tests.app.api.test_events import Stream
 from tests.app.api.test_problems import is_problem

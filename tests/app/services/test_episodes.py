@@ -29,8 +29,7 @@ from app.processes.messages.scene_messages import ComposedGoal
 from app.services.episode_results import FILES, NoTrajectory
 from app.services.episodes import AskedEpisode, EpisodeGoesOn, Episodes, GoalUnknown, NoGoal, flat, nested
 from app.services.fields import FieldCatalogue, MissingFields, NoPublishedField
-from app.services.goals.goal_checks import GoalRefused
-from app.services.goals.goals import NoTable
+from app.services.goals import GoalRefused, NoTable
 from app.storage.database import CannotStore
 from app.storage.records import GoalRecord, GoalStore, poses_to_json
 from osfcore.control.events import EpisodeSettings

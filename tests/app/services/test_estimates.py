@@ -11,9 +11,8 @@ import pytest
 from app.jobs.folders import JobFolders
 from app.jobs.job import Job, JobPage
 from app.jobs.kinds.estimates import STATE
-from app.services.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, errors_of
+from app.services.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, Uploaded, errors_of, examine
 from app.services.fields import FieldCatalogue, MissingFields
-from app.services.uploaded_observations import Uploaded, examine
 from app.storage.database import now_utc
 from app.storage.uploads import UploadRefused
 from app.storage.usage import StorageMeter

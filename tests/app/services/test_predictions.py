@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.services.fields import MissingFields
-from app.services.predictions import NothingToPush, Predictions
+from app.services.pushes import NothingToPush, Predictions
 from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState

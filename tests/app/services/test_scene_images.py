@@ -3,7 +3,7 @@ import asyncio
 import pytest
 
 from app.processes.messages.scene_messages import TakeImage
-from app.services.scene_images import ImageCache, SceneImages
+from app.services.scenes import ImageCache, SceneImages
 from osfcore.errors import OsfError, UnknownName
 from tests.support.errors import about
 

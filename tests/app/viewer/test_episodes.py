@@ -11,7 +11,7 @@ from app.jobs.job import Job, JobChanged, JobView, State
 from app.processes.messages.scene_messages import SceneChanged
 from app.processes.plan_summary import PlanSketch
 from app.services.event_hub import CurrentScene
-from app.services.goals.goals import Draft, DraftChanged
+from app.services.goals import Draft, DraftChanged
 from app.viewer.job_panels import EPISODE_INTERVAL_S, EpisodePanel
 from app.viewer.nodes.episode_nodes import GOAL, PARTS, PLAY_S, REST_S, EpisodeNodes, cost_colours
 from app.viewer.nodes.estimate_nodes import TRACKED

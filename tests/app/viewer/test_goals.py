@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.services.event_hub import CurrentScene
-from app.services.goals.goals import Draft, DraftChanged, NoDraft
+from app.services.goals import Draft, DraftChanged, NoDraft
 from app.viewer.goal_panel import WRONG, GoalPanel
 from app.viewer.nodes.episode_nodes import GOAL
 from osfcore.errors import OsfError

@@ -13,7 +13,7 @@ import viser
 from websockets.sync.client import connect
 
 from app.episodes.trajectory import ReplayClock, read_trajectory
-from app.services.examples.stories import Stories
+from app.services.examples import Stories
 from app.viewer.page_views import PageViews, Replay, Wish
 from app.viewer.private_server import SECRET_HEADER
 from tests.app.conftest import until

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from app.services.visitors.look_outlines import TRIED, Outliner
+from app.services.look_outlines import TRIED, Outliner
 from osfcore.control.events import Looking
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import default_cameras, goal_camera

@@ -1,20 +1,27 @@
-"""Six tables to begin with: objects, light, and how it should become."""
+"""The examples that come with the program: tables with goals, and their recorded stories."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from app.episodes.file_names import PREPARED_FILE, TRAJECTORY_FILE
 from app.processes.messages.scene_messages import SceneRecord
-from app.services.goals.goals import Goals
+from app.services.goals import Goals
 from app.services.runner import Runner, SceneNeeded
+from app.storage.paths import static_folder
 from app.storage.records import GoalRecord
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import shifted_poses
+from osfcore.io.files import as_mapping, read_json
+
+# Six tables to begin with: objects, light, and how it should become
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,3 +146,51 @@ def _untouched(chosen: Preset, runner: Runner) -> SceneRecord | None:
 
 def _light(azimuth_deg: float, elevation_deg: float) -> Light:
     return Light.from_angles(float(np.deg2rad(azimuth_deg)), float(np.deg2rad(elevation_deg)))
+
+
+# Stories: recorded episodes of the examples that come with the program, to be watched before anything is run
+
+
+STORY_FILE = "story.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Stories:
+    """The stories in a folder.
+
+    Attributes:
+        root: the folder.
+    """
+
+    root: Path = field(default_factory=lambda: static_folder() / "stories")
+
+    def names(self) -> tuple[str, ...]:
+        """Those that there are, sorted."""
+        return tuple(sorted(path.parent.name for path in self.root.glob(f"*/{STORY_FILE}")))
+
+    def trajectory(self, name: str) -> Path:
+        """The file with the course of a story.
+
+        Raises:
+            UnknownName: if there is none of this name.
+        """
+        return self._folder(name) / TRAJECTORY_FILE
+
+    def prepared(self, name: str) -> Path | None:
+        """The file with what was found out beforehand about an example; None if there is none."""
+        path = self.root / name / PREPARED_FILE
+        return path if name in self.names() and path.is_file() else None
+
+    def told(self, name: str) -> dict[str, Any]:
+        """What the page tells of a story.
+
+        Raises:
+            UnknownName: if there is none of this name.
+            CorruptFile: if the file is damaged.
+        """
+        return read_json(self._folder(name) / STORY_FILE, as_mapping)
+
+    def _folder(self, name: str) -> Path:
+        if name not in self.names():
+            raise UnknownName("story", name[:80], self.names())
+        return self.root / name

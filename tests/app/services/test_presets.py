@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.services.examples.presets import PRESETS, preset, set_up
+from app.services.examples import PRESETS, preset, set_up
 from app.services.scenes import TooManyScenes
 from app.storage.database import CannotStore
 from osfcore.errors import UnknownName

@@ -1,7 +1,7 @@
 import pytest
 
 from app.processes.client import ProcessUnavailable
-from app.services.objects.thumbnails import Thumbnails
+from app.services.objects import Thumbnails
 from tests.app.conftest import full_disk
 
 

@@ -13,7 +13,7 @@ from app.processes.client import ProcessUnavailable
 from app.processes.messages.scene_messages import ComposedGoal
 from app.processes.server import InternalError
 from app.services.event_hub import Hub
-from app.services.goals.goals import (
+from app.services.goals import (
     GOAL_SIDE,
     Draft,
     DraftChanged,

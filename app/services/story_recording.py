@@ -16,9 +16,8 @@ from app.episodes.file_names import FRAMES_FOLDER, PREPARED_FILE, REPORT_FILE, T
 from app.episodes.frames import TILE_PX, part_of, read_frames
 from app.episodes.request import EpisodeOrder, EpisodeStep, run_episode
 from app.episodes.trajectory import LOOK_S, ReplayClock, read_trajectory
-from app.services.examples.presets import Preset
-from app.services.examples.stories import STORY_FILE
-from app.services.goals.goals import GOAL_SIDE
+from app.services.examples import STORY_FILE, Preset
+from app.services.goals import GOAL_SIDE
 from osfcore.control.estimators import load_scene_models
 from osfcore.control.events import GoalFound, Observed, Stepped
 from osfcore.control.goal import GoalImage

@@ -3,8 +3,7 @@ import json
 import pytest
 
 from app.episodes.trajectory import ReplayClock, read_trajectory
-from app.services.examples.presets import PRESETS
-from app.services.examples.stories import Stories
+from app.services.examples import PRESETS, Stories
 from osfcore.control.prepared import prepared_from_json
 from osfcore.errors import CorruptFile, UnknownName
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.services.visitors.driver import Driver, DriverChanged
+from app.services.driver import Driver, DriverChanged
 from tests.app.conftest import until
 
 

@@ -8,8 +8,7 @@ import pytest
 from app.processes.client import ProcessUnavailable
 from app.processes.messages.neural_messages import CheckPhoto
 from app.services.fields import MissingFields
-from app.services.goals.goal_checks import GoalChecks, GoalRefused
-from app.services.goals.goals import NoTable
+from app.services.goals import GoalChecks, GoalRefused, NoTable
 from app.storage.photos import PhotoCrop
 from app.storage.records import GoalRecord, GoalStore, PhotoRecord
 from osfcore.errors import UnknownName

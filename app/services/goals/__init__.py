@@ -1,1 +1,0 @@
-"""Goal images: keeping and composing them, and checking what a photo shows."""

@@ -1,1 +1,0 @@
-"""Photographs of tables: what is marked in them, what is found, and what becomes of it."""

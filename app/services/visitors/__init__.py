@@ -1,1 +1,0 @@
-"""What concerns the people who watch: who of them drives, and what their pages draw."""
