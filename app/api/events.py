@@ -187,13 +187,13 @@ async def stream(
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow what happens: job, look, forgotten, scene, frame, goals, photos, draft, driver, notice."""
     del counted
-    mailbox = Mailbox(services.runner.current)
+    mailbox = Mailbox(services.runner.scenes.current)
     leave = services.runner.hub.subscribe(mailbox.put)
     is_watching = has_arrived = False
     try:
         if frames:
             is_watching = True  # before the call: a page that leaves during it must be counted out again
-            await run_in_threadpool(services.runner.watch_frames, 1)
+            await run_in_threadpool(services.runner.scenes.watch_frames, 1)
         if visitor is not None:
             has_arrived = True
             services.driver.arrive(visitor)
@@ -217,7 +217,7 @@ async def stream(
         if visitor is not None and has_arrived:
             services.driver.leave(visitor)
         if is_watching:
-            services.runner.watch_frames(-1)
+            services.runner.scenes.watch_frames(-1)
 
 
 async def _follow(
@@ -342,8 +342,8 @@ def _replayed(services: Services, number: int, fields: dict[str, Any]) -> Server
 
 
 def _scene_event(services: Services) -> ServerSentEvent:
-    current = services.runner.current
-    record = next((r for r in services.runner.scenes() if r.id == current), None)
+    current = services.runner.scenes.current
+    record = next((r for r in services.runner.scenes.all() if r.id == current), None)
     if record is None:
         return ServerSentEvent(event="scene", raw_data="null")
     text = services.event_texts.of(record, partial(scene_out, services, record))

@@ -130,7 +130,7 @@ SizeQuery = Annotated[ImageSize | None, Query(description="Side of the image [px
 @slow
 def create(services: ServicesDep, body: SceneIn, response: Response) -> SceneOut:
     """Make a scene and show it; it has come to rest."""
-    record = services.runner.create_scene(
+    record = services.runner.scenes.create(
         names=None if body.objects is None else tuple(body.objects),
         count=body.count,
         seed=body.seed,
@@ -146,9 +146,12 @@ def create(services: ServicesDep, body: SceneIn, response: Response) -> SceneOut
 async def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> SceneList:
     """List scenes, oldest first."""
     runner = services.runner
-    shown, total, following = page(runner.scenes(), limit, after, newest_first=False)
+    shown, total, following = page(runner.scenes.all(), limit, after, newest_first=False)
     return SceneList(
-        scenes=[scene_out(services, record) for record in shown], current=runner.current, total=total, next=following
+        scenes=[scene_out(services, record) for record in shown],
+        current=runner.scenes.current,
+        total=total,
+        next=following,
     )
 
 
@@ -171,7 +174,7 @@ def delete(services: ServicesDep, scene: SceneId) -> None:
 def activate(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Show a scene in viewer and page."""
     record_of(services, scene)
-    return scene_out(services, services.runner.activate(scene))
+    return scene_out(services, services.runner.scenes.activate(scene))
 
 
 @router.post("/{scene}/reset", responses=problems(404, 409))
@@ -179,7 +182,7 @@ def activate(services: ServicesDep, scene: SceneId) -> SceneOut:
 def reset(services: ServicesDep, scene: SceneId) -> SceneOut:
     """Put a scene back to how it was created."""
     record_of(services, scene)
-    return scene_out(services, services.runner.reset_scene(scene))
+    return scene_out(services, services.runner.scenes.reset(scene))
 
 
 @router.patch("/{scene}", responses=problems(404, 409))
@@ -187,7 +190,7 @@ def reset(services: ServicesDep, scene: SceneId) -> SceneOut:
 def change(services: ServicesDep, scene: SceneId, body: ScenePatch) -> SceneOut:
     """Move light and objects by hand, all or nothing."""
     record_of(services, scene)
-    record = services.runner.edit_scene(
+    record = services.runner.scenes.edit(
         scene,
         light=None if body.light is None else body.light.light(),
         poses=tuple(pose.named_pose() for pose in body.objects or ()),
@@ -222,7 +225,7 @@ def disturb(services: ServicesDep, scene: SceneId, body: DisturbanceIn) -> Distu
 def act(services: ServicesDep, scene: SceneId, body: ActionsIn) -> SceneOut:
     """Push: hold each velocity for 0.2 s of simulated time."""
     record_of(services, scene)
-    return scene_out(services, services.runner.act(scene, body.actions))
+    return scene_out(services, services.runner.scenes.act(scene, body.actions))
 
 
 @router.get("/{scene}/images/{camera}.png", response_class=Response, responses={**problems(404), **PNG})
@@ -256,7 +259,7 @@ async def mask(
 
 async def _png(services: Services, command: TakeImage | TakeMask) -> Response:
     try:
-        png = await services.runner.image(command)
+        png = await services.runner.scenes.image(command)
     except OsfError:
         record_of(services, command.id)  # a scene that was deleted meanwhile is not found, whatever the simulation says
         raise
@@ -265,7 +268,7 @@ async def _png(services: Services, command: TakeImage | TakeMask) -> Response:
 
 def scene_out(services: Services, record: SceneRecord) -> SceneOut:
     """A scene as it is answered."""
-    return SceneOut.of(record, services.objects.labels(), is_current=record.id == services.runner.current)
+    return SceneOut.of(record, services.objects.labels(), is_current=record.id == services.runner.scenes.current)
 
 
 def record_of(services: Services, scene: str) -> SceneRecord:
@@ -275,7 +278,7 @@ def record_of(services: Services, scene: str) -> SceneRecord:
         NotFound: if there is none.
     """
     with named_in_path():
-        return services.runner.scene(scene)
+        return services.runner.scenes.get(scene)
 
 
 def view_of(services: Services, scene: str, camera: str) -> SceneRecord:
@@ -357,7 +360,7 @@ async def _observe(services: Services, command: TakeImage, tries: int = 3) -> tu
     """A camera's image, and the scene as it was then; while things keep moving, one that is close."""
     record = view_of(services, command.id, command.camera)
     try:
-        observed = await services.runner.image(command)
+        observed = await services.runner.scenes.image(command)
     except OsfError:
         view_of(services, command.id, command.camera)  # a scene that was deleted meanwhile is not found
         raise

@@ -35,7 +35,7 @@ def faults(runner: Runner, data_dir: pathlib.Path) -> tuple[str, ...]:
         data_dir: where everything is stored.
     """
     found = [runner.jobs.problem, _disk_problem(data_dir), runner.storage.problem, runner.storing_problem()]
-    if runner.simulation_status == "restarting":
+    if runner.scenes.status == "restarting":
         found.append("The simulation has stopped and is being restarted.")
     return tuple(sentence for sentence in found if sentence is not None)
 
@@ -98,8 +98,8 @@ class _State(Collector):
         runner = self._runner
         for name, text, value in (
             ("osf_uptime_seconds", "Since the service was started.", runner.uptime_s),
-            ("osf_scenes", "Scenes that are kept.", len(runner.scenes())),
-            ("osf_stage_ready", "1 while the simulation takes commands.", runner.simulation_status == "ready"),
+            ("osf_scenes", "Scenes that are kept.", len(runner.scenes.all())),
+            ("osf_stage_ready", "1 while the simulation takes commands.", runner.scenes.status == "ready"),
         ):
             yield GaugeMetricFamily(name, text, value=float(value))
         jobs = GaugeMetricFamily("osf_jobs", "Jobs by kind and state.", labels=("kind", "state"))
@@ -204,7 +204,7 @@ def health(services: ServicesDep) -> Health:
         version=VERSION,
         uptime_s=round(services.runner.uptime_s, 3),
         objects_available=len(services.objects.names()),
-        stage=services.runner.simulation_status,
+        stage=services.runner.scenes.status,
     )
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from app.processes.client import ProcessUnavailable
-from app.processes.messages.scene_messages import Act, ObserveScene, TakeView
+from app.processes.messages.scene_messages import JobCommand
 from app.processes.server import Answer
 from osfcore.errors import OsfError
 from osfcore.objects.asset_library import AssetLibrary
@@ -62,7 +62,7 @@ class JobStep:
 class SceneCommand:
     """Something to be done with the scene that a job drives. Answered by an Answer of the same number."""
 
-    command: Act | ObserveScene | TakeView
+    command: JobCommand
     number: int = 0
 
 
@@ -181,7 +181,7 @@ class JobControl:
         if self._is_cancelled.is_set():
             call()
 
-    def ask(self, command: Act | ObserveScene | TakeView) -> Any:  # noqa: ANN401  each command says what answers it
+    def ask(self, command: JobCommand) -> Any:  # noqa: ANN401  each command says what answers it
         """Have something done with the scene that this job drives, and wait for the answer.
 
         Raises:

@@ -19,7 +19,7 @@ from app.jobs.job import Job, JobChanged, JobView, ended
 from app.jobs.kinds import KINDS
 from app.jobs.process import JobDied, JobProcess, JobStopped, Outcome
 from app.jobs.table import JobTable
-from app.processes.messages.scene_messages import Command
+from app.processes.messages.scene_messages import JobCommand
 from app.processes.server import Answer, InternalError
 from app.storage.database import now_utc
 from osfcore.errors import OsfError, UnknownName
@@ -48,7 +48,7 @@ class JobLoop:
         table: JobTable,
         data_dir: Path,
         publish: Callable[[JobChanged | JobView], None],
-        serve: Callable[[Command], Any] | None,
+        serve: Callable[[JobCommand], Any] | None,
         start_process: StartProcess,
     ) -> None:
         self._changed, self._table = changed, table

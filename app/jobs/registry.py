@@ -22,7 +22,7 @@ from app.jobs.kinds import KINDS, in_words
 from app.jobs.loop import JobLoop, StartProcess, after, clear_cancelled
 from app.jobs.process import JobProcess, JobStopped
 from app.jobs.table import JobTable
-from app.processes.messages.scene_messages import Command
+from app.processes.messages.scene_messages import JobCommand
 from app.storage.database import CannotStore, Store
 from osfcore.errors import OsfError
 
@@ -71,7 +71,7 @@ class Jobs:
         publish: Callable[[JobEvent], None],
         max_queued: int = 20,
         cancel_grace_s: float = 0.7,
-        serve: Callable[[Command], Any] | None = None,
+        serve: Callable[[JobCommand], Any] | None = None,
         start_process: StartProcess = JobProcess,
     ) -> None:
         self._data_dir = data_dir

@@ -30,6 +30,7 @@ from app.processes.messages.scene_messages import (
     DropScene,
     EditScene,
     FramesTaken,
+    ObservedScene,
     ObserveScene,
     ResetScene,
     SceneChanged,
@@ -166,7 +167,7 @@ class Simulation:
             case TakeImage():
                 return image_png(self._world(command.id), command)
             case TakeView(scene, camera, pusher):
-                return view_png(self._world(scene), camera, with_pusher=pusher)
+                return to_uint8(self._world(scene).render((camera,), with_pusher=pusher).images[0])
             case TakeMask():
                 return mask_png(self._world(command.id), command)
             case ObserveScene():
@@ -303,16 +304,14 @@ class Simulation:
 
     # Pictures
 
-    def _observe(self, command: ObserveScene) -> SceneRecord:
-        from osfcore.io.observation_file import write_observation
-
+    def _observe(self, command: ObserveScene) -> ObservedScene:
         record, world = self._record(command.id), self._world(command.id)
         cameras = (goal_camera(record.image_size),) if command.goal else default_cameras(record.image_size)
         observation = world.render(cameras, masks=command.masks, with_pusher=not command.goal)
         if not command.goal:
             observation = self._disturbances.apply(command.id, observation)
-        write_observation(command.folder, observation)
-        return replace(record, state=world.truth())
+        images = to_uint8(observation.images).astype(np.float32) / 255  # as cameras deliver them
+        return ObservedScene(replace(record, state=world.truth()), replace(observation, images=images))
 
     def _compose(self, command: ComposeGoal) -> ComposedGoal:
         from osfcore.world.tasks import arranged_goal, random_goal
@@ -366,11 +365,6 @@ def image_png(world: Tabletop, command: TakeImage) -> bytes:
     observation = world.render((_camera(command),), masks=command.masks, with_pusher=command.pusher)
     pixels = to_uint8(observation.images[0])
     return encode_png(pixels if observation.masks is None else tint_masks(pixels, observation.masks[0]))
-
-
-def view_png(world: Tabletop, camera: Camera, *, with_pusher: bool) -> bytes:
-    """What any camera would see."""
-    return encode_png(to_uint8(world.render((camera,), with_pusher=with_pusher).images[0]))
 
 
 def mask_png(world: Tabletop, command: TakeMask) -> bytes:

@@ -10,7 +10,7 @@ import numpy as np
 
 from app.processes.disturbances import Disturbance
 from app.processes.messages.scene_messages import Disturb, EditScene, SceneRecord
-from app.services.runner import Runner
+from app.services.scenes import Scenes
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
@@ -37,12 +37,12 @@ class Disturber:
     """Does to a scene what nobody tells the program. Blocks until it is done; any thread may call.
 
     Args:
-        runner: holds the scenes.
+        scenes: of the service.
         rng: chooses angles, objects and cameras.
     """
 
-    def __init__(self, runner: Runner, rng: np.random.Generator) -> None:
-        self._runner, self._rng = runner, rng
+    def __init__(self, scenes: Scenes, rng: np.random.Generator) -> None:
+        self._scenes, self._rng = scenes, rng
         self._lock = threading.Lock()
 
     def disturb(self, scene: str, kind: Kind) -> tuple[SceneRecord, str]:
@@ -59,7 +59,7 @@ class Disturber:
             UnknownName: if there is no such scene.
             NoRoomToNudge: if no object can be moved.
         """
-        record = self._runner.scene(scene)
+        record = self._scenes.get(scene)
         does: dict[Kind, Callable[[SceneRecord], tuple[SceneRecord, str]]] = {
             "turn lamp": self._turn,
             "dim light": self._dim,
@@ -74,7 +74,7 @@ class Disturber:
         azimuth = np.arctan2(y, x) + self._rng.choice([-1, 1]) * self._rng.uniform(*_TURN_RAD)
         light = Light.from_angles(float(azimuth), float(self._rng.uniform(*_ELEVATION_RAD)))
         angle_deg = np.rad2deg(light.angle_to(record.state.light))
-        return self._runner.disturb(EditScene(record.id, light)), f"The lamp was moved by {angle_deg:.0f}°."
+        return self._scenes.disturb(EditScene(record.id, light)), f"The lamp was moved by {angle_deg:.0f}°."
 
     def _nudge(self, record: SceneRecord) -> tuple[SceneRecord, str]:
         state = record.state
@@ -89,7 +89,7 @@ class Disturber:
                     continue
                 try:
                     poses = ((str(name), Pose(place, pose.quaternion)),)
-                    moved = self._runner.disturb(EditScene(record.id, poses=poses, settle=True))
+                    moved = self._scenes.disturb(EditScene(record.id, poses=poses, settle=True))
                 except (OverlappingObjects, InvalidInput):
                     continue
                 return moved, f"{name} was moved by {100 * length:.0f} cm."
@@ -103,12 +103,12 @@ class Disturber:
     def _dim(self, record: SceneRecord) -> tuple[SceneRecord, str]:
         brightness = self._toggle(record.id, None).brightness
         text = f"The light was dimmed to {100 * brightness:.0f} %." if brightness != 1.0 else "The light is as it was."
-        return self._runner.scene(record.id), text
+        return self._scenes.get(record.id), text
 
     def _cover(self, record: SceneRecord) -> tuple[SceneRecord, str]:
         covered = self._toggle(record.id, str(self._rng.choice([camera.name for camera in default_cameras()]))).covered
         text = "".join(f"Camera {name} is covered." for name in covered) or "No camera is covered now."
-        return self._runner.scene(record.id), text
+        return self._scenes.get(record.id), text
 
     def _toggle(self, scene: str, camera: str | None) -> Disturbance:
-        return self._runner.disturb(Disturb(scene, camera))
+        return self._scenes.disturb(Disturb(scene, camera))

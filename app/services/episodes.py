@@ -115,10 +115,10 @@ class Episodes(EpisodeResults):
             StorageFull: if nothing more may be written.
         """
         check_seed(asked.seed)
-        scene = asked.scene or self._runner.current
+        scene = asked.scene or self._runner.scenes.current
         if scene is None:
             raise NoTable
-        names = self._runner.scene(scene).state.names
+        names = self._runner.scenes.get(scene).state.names
         self._fields.require(names, asked.method)
         settings = nested(asked.settings, asked.method)
         despite_doubts = settings_of(settings).despite_doubts
@@ -192,7 +192,7 @@ class Episodes(EpisodeResults):
 
     def _rendered(self, poses: Poses, scene: str, folder: Path) -> dict[str, Any]:
         """A goal that was given as poses, as the image that a method wants which knows of nothing else."""
-        made = self._runner.compose(ComposeGoal(scene, poses, size=GOAL_SIDE))
+        made = self._runner.scenes.compose(ComposeGoal(scene, poses, size=GOAL_SIDE))
         write_atomically(folder / GOAL_FILE, made.png)
         camera = camera_to_json(goal_camera(GOAL_SIDE))
         return {"id": None, "camera": camera, "poses": None, "truth": poses_to_json(made.poses)}

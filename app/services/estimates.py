@@ -36,7 +36,7 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.io.files import read_json, write_json
 from osfcore.io.json_codec import decode
-from osfcore.io.observation_file import OBSERVATION_FILE, ObservationJson
+from osfcore.io.observation_file import OBSERVATION_FILE, ObservationJson, write_observation
 from osfcore.io.scene_file import EstimateJson, read_estimated, read_scene, state_to_json, write_estimated
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.method import Method
@@ -119,21 +119,21 @@ class Estimates:
             QueueFull: if too many jobs wait.
         """
         asked.check()
-        scene = scene or self._runner.current
+        scene = scene or self._runner.scenes.current
         if scene is None:
             raise NoScene
-        names = self._runner.scene(scene).state.names
+        names = self._runner.scenes.get(scene).state.names
         self._fields.require(names, asked.method)
         prior = None if asked.mode == "first" else self._prior(asked, names, scene)
         with self._runner.jobs.new_inputs() as folder:
             is_goal = asked.mode == "goal"
-            observation = self._runner.observe(scene, folder / OBSERVATION, goal=is_goal, masks=asked.mode == "first")
-            write_json(folder / TRUTH, state_to_json(observation.state))
+            seen = self._runner.scenes.observe(scene, goal=is_goal, masks=asked.mode == "first")
+            write_observation(folder / OBSERVATION, seen.observation)
+            write_json(folder / TRUTH, state_to_json(seen.record.state))
             if prior is not None:
                 write_estimated(folder / PRIOR, prior)
-            cameras = _observation(folder / OBSERVATION).cameras
-            of = {"scene": scene, "revision": observation.revision, "file_name": None}
-            return self._submit(asked, of, names, tuple(camera.name for camera in cameras), folder)
+            of = {"scene": scene, "revision": seen.record.revision, "file_name": None}
+            return self._submit(asked, of, names, tuple(camera.name for camera in seen.observation.cameras), folder)
 
     async def of_upload(self, asked: Asked, chunks: AsyncIterator[bytes], file_name: str) -> Job:
         """Take in a zipped observation folder, and estimate what it shows.

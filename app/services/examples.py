@@ -117,7 +117,7 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
                 return _put_back(made.scene, runner), made
     # Shown when all is there: the pages ask for its images then, and the goal's would wait behind them.
     there = _untouched(chosen, runner)
-    scene = there or runner.create_scene(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
+    scene = there or runner.scenes.create(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
     try:
         poses = tuple(shifted_poses(scene.state, chosen.shifts_m).items())
         goal = goals.compose(scene.id, poses, chosen.title, chosen.goal_light, chosen.id)
@@ -125,19 +125,19 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
         if there is None:
             runner.delete_scene(scene.id)
         raise
-    return runner.activate(scene.id), goal
+    return runner.scenes.activate(scene.id), goal
 
 
 def _put_back(scene: str, runner: Runner) -> SceneRecord:
     if (job := runner.jobs.needs(scene)) is not None:
         raise SceneNeeded(job)
-    runner.reset_scene(scene)
-    return runner.activate(scene)
+    runner.scenes.reset(scene)
+    return runner.scenes.activate(scene)
 
 
 def _untouched(chosen: Preset, runner: Runner) -> SceneRecord | None:
     """The table of a preset that is there already, such as that of a new service, if nobody has changed it."""
-    for scene in runner.scenes():
+    for scene in runner.scenes.all():
         is_same = (scene.seed, scene.state.names, scene.revision) == (chosen.seed, chosen.objects, 1)
         if is_same and scene.state.light.angle_to(chosen.light) < _SAME_RAD and runner.jobs.needs(scene.id) is None:
             return scene

@@ -19,6 +19,7 @@ from app.processes.messages.neural_messages import CheckPhoto
 from app.processes.messages.scene_messages import ComposedGoal, ComposeGoal, SceneRecord
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.runner import Runner
+from app.services.scenes import Scenes
 from app.storage.database import now_utc
 from app.storage.photos import Photo, PhotoCrop, PhotoReader, central_crop, check_crop, cut_out
 from app.storage.records import Damaged, GoalRecord, GoalStore, PhotoRecord, Poses, Source
@@ -240,7 +241,7 @@ class Goals:
         return self._keep("photo", name, scene, camera, poses, png)
 
     def _made(self, source: Source, command: ComposeGoal, name: str, example: str | None = None) -> GoalRecord:
-        made = self._runner.compose(command)
+        made = self._runner.scenes.compose(command)
         return self._keep(source, name, command.id, goal_camera(GOAL_SIDE), made.poses, made.png, example)
 
     def _keep(
@@ -262,10 +263,10 @@ class Goals:
         return record
 
     def _scene(self, scene: str | None) -> str:
-        scene = scene or self._runner.current
+        scene = scene or self._runner.scenes.current
         if scene is None:
             raise NoTable
-        return self._runner.scene(scene).id
+        return self._runner.scenes.get(scene).id
 
     # The one that is being composed
 
@@ -283,7 +284,7 @@ class Goals:
         """
         with self._drafting:
             scene = self._scene(scene)
-            made = self._runner.compose(ComposeGoal(scene, size=GOAL_SIDE))
+            made = self._runner.scenes.compose(ComposeGoal(scene, size=GOAL_SIDE))
             return self._set_draft(Draft(scene, made.poses, revision=self._next_revision()), made)
 
     def move_draft(self, poses: Poses) -> Draft:
@@ -304,7 +305,7 @@ class Goals:
             laid = tuple(placed.items())
             number = self._next_revision()
             try:
-                made = self._runner.compose(ComposeGoal(draft.scene, laid, size=GOAL_SIDE))
+                made = self._runner.scenes.compose(ComposeGoal(draft.scene, laid, size=GOAL_SIDE))
             except _MISPLACED as error:
                 return self._set_draft(Draft(draft.scene, laid, str(error), number), None)
             return self._set_draft(Draft(draft.scene, made.poses, "", number), made)
@@ -399,7 +400,7 @@ class GoalChecks:
     """Checks goals, and remembers what it has found. Methods block; any thread may call.
 
     Args:
-        runner: knows the scenes.
+        scenes: of the service.
         fields: what can be recognised.
         goals: goal images.
         link: to the process that looks at photos.
@@ -408,13 +409,13 @@ class GoalChecks:
 
     def __init__(
         self,
-        runner: Runner,
+        scenes: Scenes,
         fields: FieldCatalogue,
         goals: Goals,
         link: ProcessClient,
         labels: Callable[[], Mapping[str, str]],
     ) -> None:
-        self._runner, self._fields, self._goals, self._link, self._labels = runner, fields, goals, link, labels
+        self._scenes, self._fields, self._goals, self._link, self._labels = scenes, fields, goals, link, labels
         self._found: dict[object, ContentCheck] = {}
         self._one_at_a_time = threading.Lock()  # a second page that asks the same waits for the first one's answer
 
@@ -427,10 +428,10 @@ class GoalChecks:
             ProcessUnavailable: if what looks at photos has died.
         """
         record = self._goals.get(goal)
-        scene = scene or self._runner.current
+        scene = scene or self._scenes.current
         if scene is None:
             raise NoTable
-        table = self._runner.scene(scene)
+        table = self._scenes.get(scene)
         if record.poses is not None:
             return self._made_here(record, table)
         if missing := sorted(set(table.state.names) - set(self._fields.names())):
@@ -458,7 +459,7 @@ class GoalChecks:
             return GoalCheck("shown")
         text = f"This goal was made for another table, with {self._listed(names)}."
         try:
-            home = None if goal.scene is None else self._runner.scene(goal.scene).id
+            home = None if goal.scene is None else self._scenes.get(goal.scene).id
         except UnknownName:
             home = None
         return GoalCheck("other table", text, home)

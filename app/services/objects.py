@@ -92,7 +92,7 @@ class OwnObjects:
         label = self._runner.library.label(name)
         if name in CATALOGUE:
             raise CatalogueObject(label)
-        scenes = sum(name in record.state.names for record in self._runner.scenes())
+        scenes = sum(name in record.state.names for record in self._runner.scenes.all())
         if scenes:
             which = "a scene; delete that scene first" if scenes == 1 else f"{scenes} scenes; delete those scenes first"
             raise ObjectNeeded(label, which)

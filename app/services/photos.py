@@ -432,7 +432,7 @@ class PhotoTables:
         """
         record = self._photos.get(photo)
         layout = self._layout(record, despite_doubts=despite_doubts)
-        scene = self._runner.create_scene(poses=tuple(layout.poses.items()), light=layout.light, is_measured=True)
+        scene = self._runner.scenes.create(poses=tuple(layout.poses.items()), light=layout.light, is_measured=True)
         place = layout.T_table_photo
         self._photos.change(photo, lambda latest: replace(latest, scene=scene.id, T_table_photo=place))
         return TableMade(scene, _moved(layout.poses, scene.initial))
@@ -460,14 +460,14 @@ class PhotoTables:
         png = self._reduced(record, camera.width, camera.height)
         table = home or self._elsewhere(layout)
         try:
-            made = self._runner.compose(ComposeGoal(table.id, tuple(layout.poses.items()), is_measured=True))
+            made = self._runner.scenes.compose(ComposeGoal(table.id, tuple(layout.poses.items()), is_measured=True))
             goal = self._goals.keep_photographed(record.name, table.id, camera, made.poses, png)
         except OsfError:
             if home is None:
                 self._runner.delete_scene(table.id)
             raise
         if home is None:
-            self._runner.activate(table.id)
+            self._runner.scenes.activate(table.id)
         return GoalMade(table, _moved(layout.poses, dict(made.poses)), goal)
 
     def drawing(self, photo: str) -> bytes:
@@ -503,26 +503,26 @@ class PhotoTables:
     def _home(self, scene: str | None, names: set[str]) -> SceneRecord | None:
         """The table that was asked for, else the current one if it holds the objects; None if there is none."""
         if scene is not None:
-            return self._runner.scene(scene)
-        current = None if self._runner.current is None else self._runner.scene(self._runner.current)
+            return self._runner.scenes.get(scene)
+        current = None if self._runner.scenes.current is None else self._runner.scenes.get(self._runner.scenes.current)
         return current if current is not None and set(current.state.names) == names else None
 
     def _elsewhere(self, layout: TableLayout) -> SceneRecord:
         """A new table, not shown yet, whose objects lie on the same sides as in the photo, but in other places."""
         poses = tuple(layout.poses.items())
-        draft = self._runner.create_scene(poses=poses, light=layout.light, is_measured=True, is_shown=False)
+        draft = self._runner.scenes.create(poses=poses, light=layout.light, is_measured=True, is_shown=False)
         try:
             start = self._shifted(draft)
         finally:
             self._runner.delete_scene(draft.id)
-        return self._runner.create_scene(poses=start, light=layout.light, seed=draft.seed, is_shown=False)
+        return self._runner.scenes.create(poses=start, light=layout.light, seed=draft.seed, is_shown=False)
 
     def _shifted(self, draft: SceneRecord) -> Poses:
         """A random layout: all objects shifted, or as many as there is room for."""
         with contextlib.suppress(NoRoom):
             count = len(draft.state.names)
-            return self._runner.compose(ComposeGoal(draft.id, seed=draft.seed, moved=count)).poses
-        return self._runner.compose(ComposeGoal(draft.id, seed=draft.seed)).poses
+            return self._runner.scenes.compose(ComposeGoal(draft.id, seed=draft.seed, moved=count)).poses
+        return self._runner.scenes.compose(ComposeGoal(draft.id, seed=draft.seed)).poses
 
     def _reduced(self, record: TablePhoto, width: int, height: int) -> bytes:
         jpeg = self._photos.read(self._photos.picture(record.id), record.id)

@@ -15,7 +15,7 @@ from app.processes.messages.neural_messages import NeuralAnswer, PredictPushes
 from app.processes.messages.scene_messages import SceneRecord
 from app.services.estimates import errors_of
 from app.services.fields import MissingFields
-from app.services.runner import Runner
+from app.services.scenes import Scenes
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts, check_actions
@@ -141,13 +141,13 @@ class Predictions:
     """Asks for predictions. Any thread may call.
 
     Args:
-        runner: knows the scenes.
+        scenes: of the service.
         fields: names of the objects that have a field, from which their shape is known.
         link: to the process that predicts.
     """
 
-    def __init__(self, runner: Runner, fields: Callable[[], Collection[str]], link: ProcessClient) -> None:
-        self._runner = runner
+    def __init__(self, scenes: Scenes, fields: Callable[[], Collection[str]], link: ProcessClient) -> None:
+        self._scenes = scenes
         self._fields = fields
         self._link = link
 
@@ -162,10 +162,10 @@ class Predictions:
         Raises:
             NothingToPush: if there is none.
         """
-        current = self._runner.current
+        current = self._scenes.current
         if current is None:
             raise NothingToPush
-        return self._runner.scene(current)
+        return self._scenes.get(current)
 
     def submit(
         self,

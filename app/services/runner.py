@@ -14,8 +14,7 @@ from app.jobs.job import Job, JobChanged, JobEvent
 from app.jobs.kinds import KINDS, in_words
 from app.jobs.process import JobProcess, Standby
 from app.jobs.registry import Jobs
-from app.processes.messages.scene_messages import Act, Command, Disturb, EditScene, UndoDisturbances
-from app.services.event_hub import Notice
+from app.services.event_hub import Hub, Notice
 from app.services.image_sets import ImageSets
 from app.services.scenes import DEMO_OBJECTS, Scenes
 from app.services.service_settings import Settings
@@ -74,7 +73,7 @@ class DemoScene:
     light: Light
 
 
-class Runner(Scenes):
+class Runner:
     """Scenes, jobs and their events.
 
     Methods that wait for the simulation block; those that only read answer from memory. Any thread may call them.
@@ -87,8 +86,9 @@ class Runner(Scenes):
     """
 
     def __init__(self, settings: Settings, store: Store, library: AssetLibrary, demo: DemoScene | None = None) -> None:
-        super().__init__(settings, store, library)
-        self._demo = demo
+        self._settings, self._store, self._demo = settings, store, demo
+        self.library, self.hub = library, Hub()
+        self.scenes = Scenes(settings, store, library, self.hub, self.holder)
         self._standby = Standby() if settings.standby else None
         self.jobs = Jobs(
             store,
@@ -96,7 +96,7 @@ class Runner(Scenes):
             self._on_job,
             settings.max_queued_jobs,
             settings.cancel_grace_s,
-            self._serve,
+            self.scenes.serve,
             start_process=JobProcess if self._standby is None else self._standby.process,
         )
         self.storage = StorageMeter(settings.data_dir, settings.max_data_bytes, settings.min_free_bytes)
@@ -111,7 +111,7 @@ class Runner(Scenes):
         self.sets.start()
         for folder in ("fields", "training"):
             sweep(self._settings.data_dir / folder)
-        super().start()
+        self.scenes.start()
         self.jobs.start()
         if self._standby is not None:
             self._standby.prepare()
@@ -126,7 +126,7 @@ class Runner(Scenes):
         self.jobs.stop()
         if self._standby is not None:
             self._standby.stop()
-        super().stop()
+        self.scenes.stop()
         self.storage.stop()
 
     def holder(self, scene: str) -> str | None:
@@ -186,7 +186,7 @@ class Runner(Scenes):
         self.storage.check_room()
         with self._ordering:
             if "scene" in params:
-                self.scene(params["scene"])
+                self.scenes.get(params["scene"])
             return self.jobs.submit(kind, params, inputs)
 
     def forget_job(self, job: str) -> None:
@@ -204,19 +204,7 @@ class Runner(Scenes):
         with self._ordering:
             if (job := self.jobs.needs(scene)) is not None:
                 raise SceneNeeded(job)
-            super().delete_scene(scene)
-
-    def disturb(self, command: Disturb | EditScene) -> Any:  # noqa: ANN401  each command says what answers it
-        """Do something to a scene or its pictures, even while a job drives it.
-
-        Raises:
-            UnknownName: if there is no such scene or object.
-            OsfError: if something would overlap; then nothing moves.
-        """
-        if isinstance(command, EditScene):
-            return self._change(command)
-        self.scene(command.id)
-        return self._simulation.call(command)
+            self.scenes.delete(scene)
 
     def leftovers(self) -> tuple[Leftover, ...]:
         """What trainings have left that did not finish, or have made so far, sorted by name."""
@@ -257,9 +245,9 @@ class Runner(Scenes):
 
     def ensure_demo_scene(self) -> None:
         """Make the first scene as soon as there are objects, in the background; does nothing if there is a scene."""
-        with self._lock:
+        with self._ordering:
             count = min(DEMO_OBJECTS, len(self.library.names()))
-            if not self._demo_due or self._records or count == 0:
+            if not self._demo_due or self.scenes.all() or count == 0:
                 return
             self._demo_due = False
         threading.Thread(target=self._make_demo_scene, args=(count,), name="demo-scene", daemon=True).start()
@@ -267,17 +255,13 @@ class Runner(Scenes):
     def _make_demo_scene(self, count: int) -> None:
         try:
             if self._demo is not None and all(map(self.library.has, self._demo.names)):
-                self.create_scene(names=self._demo.names, seed=self._demo.seed, light=self._demo.light)
+                self.scenes.create(names=self._demo.names, seed=self._demo.seed, light=self._demo.light)
             else:
-                self.create_scene(count=count, seed=0)
+                self.scenes.create(count=count, seed=0)
         except OsfError as error:
             self.hub.publish(Notice("warning", f"No first scene could be made. {error}"))
 
     # Inside
-
-    def _serve(self, command: Command) -> Any:  # noqa: ANN401  each command says what answers it
-        """Carry out what a job asks for with its own scene."""
-        return self._change(command) if isinstance(command, Act) else self._simulation.call(command)
 
     def _check_training(self, params: dict[str, Any]) -> None:
         name, source = check_name(params["name"]), params["source"]
@@ -307,4 +291,4 @@ class Runner(Scenes):
     def _undo_disturbances(self, scene: str) -> None:
         """What was done to fool an episode ends with it, or the next one would begin in the dark."""
         with contextlib.suppress(OsfError):  # the scene may be gone, and the simulation just starting again
-            self._simulation.call(UndoDisturbances(scene))
+            self.scenes.undo_disturbances(scene)

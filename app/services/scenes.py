@@ -9,7 +9,7 @@ import uuid
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 from app.processes.client import ProcessClient, Status
 from app.processes.messages.scene_messages import (
@@ -19,9 +19,12 @@ from app.processes.messages.scene_messages import (
     ComposedGoal,
     ComposeGoal,
     CreateScene,
+    Disturb,
     DropScene,
     EditScene,
     FramesTaken,
+    JobCommand,
+    ObservedScene,
     ObserveScene,
     ResetScene,
     SceneChanged,
@@ -29,6 +32,7 @@ from app.processes.messages.scene_messages import (
     ShowScene,
     TakeImage,
     TakeMask,
+    UndoDisturbances,
     WatchFrames,
 )
 from app.processes.sim_process import simulation_main
@@ -63,13 +67,25 @@ class TooManyScenes(OsfError):
 
 
 class Scenes:
-    """The scenes of one data directory. Changing one waits for the simulation; any thread may call."""
+    """The scenes of one data directory. Changing one waits for the simulation; any thread may call.
 
-    def __init__(self, settings: Settings, store: Store, library: AssetLibrary) -> None:
-        self._settings = settings
-        self._store = store
-        self.library = library
-        self.hub = Hub()
+    Args:
+        settings: of the service.
+        store: keeps them.
+        library: meshes of the objects.
+        hub: told of every change.
+        holder: returns what drives a scene, in words, if a job does: then only that job may change it.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        store: Store,
+        library: AssetLibrary,
+        hub: Hub,
+        holder: Callable[[str], str | None] = lambda _: None,
+    ) -> None:
+        self._settings, self._store, self._library, self._hub, self._holder = settings, store, library, hub, holder
         self._simulation = ProcessClient(
             simulation_main,
             (library.root, settings.max_live_worlds),
@@ -78,14 +94,14 @@ class Scenes:
             keeps_running=True,
             greeting=self._greeting,
             on_event=self._on_simulation_event,
-            on_lost=lambda: self.hub.publish(Notice("error", _LOST)),
+            on_lost=lambda: hub.publish(Notice("error", _LOST)),
         )
         self._lock = threading.RLock()
         self._records: dict[str, SceneRecord] = {}
         self._current: str | None = None
         self._watchers = self._scenes_in_the_making = 0
         self._images = SceneImages(
-            settings.image_cache_bytes, lambda scene: self.scene(scene).revision, self._simulation.call_async
+            settings.image_cache_bytes, lambda scene: self.get(scene).revision, self._simulation.call_async
         )
 
     def start(self) -> None:
@@ -99,18 +115,14 @@ class Scenes:
         """End the simulation. Calling it again does nothing."""
         self._simulation.stop()
 
-    def holder(self, scene: str) -> str | None:
-        """The job that drives a scene, if one does: then only that job may change it."""
-        return None
-
     # Reading
 
     @property
-    def simulation_status(self) -> Status:
+    def status(self) -> Status:
         """Whether scenes can be worked with."""
         return self._simulation.status
 
-    def scenes(self) -> tuple[SceneRecord, ...]:
+    def all(self) -> tuple[SceneRecord, ...]:
         """All scenes, oldest first."""
         return tuple(self._records.values())  # without the lock: whoever writes to the disk holds it
 
@@ -119,8 +131,12 @@ class Scenes:
         """The scene that is shown."""
         return self._current
 
-    def scene(self, scene: str) -> SceneRecord:
-        """One scene; raises UnknownName if there is none."""
+    def get(self, scene: str) -> SceneRecord:
+        """Return one scene.
+
+        Raises:
+            UnknownName: if there is none.
+        """
         record = self._records.get(scene)
         if record is None:
             raise NotThere("scene")
@@ -128,7 +144,7 @@ class Scenes:
 
     # Changing
 
-    def create_scene(
+    def create(
         self,
         names: tuple[str, ...] | None = None,
         count: int = DEMO_OBJECTS,
@@ -177,7 +193,7 @@ class Scenes:
             self.activate(record.id)
         return record
 
-    def delete_scene(self, scene: str) -> None:
+    def delete(self, scene: str) -> None:
         """Forget a scene; if it was shown, the latest other one is shown.
 
         Raises:
@@ -185,7 +201,7 @@ class Scenes:
         """
         self._check_free(scene)
         with self._lock:
-            self.scene(scene)
+            self.get(scene)
             self._store.delete_scene(scene)
             del self._records[scene]
             self._simulation.submit(DropScene(scene))
@@ -195,11 +211,11 @@ class Scenes:
     def activate(self, scene: str) -> SceneRecord:
         """Show a scene in viewer and pages; raises UnknownName if there is none."""
         with self._lock:
-            record = self.scene(scene)
+            record = self.get(scene)
             self._show(scene)
             return record
 
-    def reset_scene(self, scene: str) -> SceneRecord:
+    def reset(self, scene: str) -> SceneRecord:
         """Put a scene back to how it was created.
 
         Raises:
@@ -210,7 +226,7 @@ class Scenes:
         self._check_free(scene)
         return self._change(ResetScene(scene), can_be_undone=True)
 
-    def edit_scene(
+    def edit(
         self, scene: str, light: Light | None = None, poses: tuple[tuple[str, Pose], ...] = (), *, settle: bool = False
     ) -> SceneRecord:
         """Move light and objects by hand, all or nothing.
@@ -252,12 +268,11 @@ class Scenes:
         image_side(command.size)
         return await self._images.image(command)
 
-    def observe(self, scene: str, folder: Path, *, goal: bool, masks: bool) -> SceneRecord:
-        """Write what the robot sees of a scene now; returns the scene as it was then.
+    def observe(self, scene: str, *, goal: bool, masks: bool) -> ObservedScene:
+        """Return what the robot sees of a scene now, with the scene as it was then.
 
         Args:
             scene: identifier.
-            folder: of the observation, to write.
             goal: the goal camera's view alone, without the pusher.
             masks: whether to tell each object's visible pixels.
 
@@ -265,8 +280,8 @@ class Scenes:
             UnknownName: if there is no such scene.
             OsfError: if the simulation is not there now.
         """
-        self.scene(scene)
-        return self._simulation.call(ObserveScene(scene, folder, goal, masks))
+        self.get(scene)
+        return self._simulation.call(ObserveScene(scene, goal, masks))
 
     def compose(self, command: ComposeGoal) -> ComposedGoal:
         """How a scene could become, seen by the goal camera; the scene stays as it is.
@@ -275,11 +290,40 @@ class Scenes:
             UnknownName, SceneHeld: if there is no such scene or object, or a job uses the scene.
             OsfError: if something would overlap, or makes no sense.
         """
-        self.scene(command.id)
+        self.get(command.id)
         self._check_free(command.id)
         _check_poses(command.poses)
         image_side(command.size)
         return self._simulation.call(command)
+
+    def disturb(self, command: Disturb | EditScene) -> Any:  # noqa: ANN401  each command says what answers it
+        """Do something to a scene or its pictures, even while a job drives it.
+
+        Raises:
+            UnknownName: if there is no such scene or object.
+            OsfError: if something would overlap; then nothing moves.
+        """
+        if isinstance(command, EditScene):
+            return self._change(command)
+        self.get(command.id)
+        return self._simulation.call(command)
+
+    def undo_disturbances(self, scene: str) -> None:
+        """Put light and cameras back to how they are without `disturb`.
+
+        Raises:
+            OsfError: if the scene is gone, or the simulation is not there now.
+        """
+        self._simulation.call(UndoDisturbances(scene))
+
+    def serve(self, command: JobCommand) -> Any:  # noqa: ANN401  each command says what answers it
+        """Do what the job that drives a scene asks for.
+
+        Raises:
+            UnknownName: if there is no such scene.
+            OsfError: if it cannot be done, or the simulation is not there now.
+        """
+        return self._change(command) if isinstance(command, Act) else self._simulation.call(command)
 
     def watch_frames(self, change: int) -> None:
         """Tell that `change` more (or less, if negative) listeners look at live images."""
@@ -301,7 +345,7 @@ class Scenes:
             UnknownName: if there is no such scene.
             CannotStore: if the disk refuses, and the change was undone.
         """
-        before = self.scene(command.id)
+        before = self.get(command.id)
         record: SceneRecord = self._simulation.call(command)
         with self._lock:
             latest = self._records.get(command.id)
@@ -320,7 +364,7 @@ class Scenes:
         self._current = scene
         self._store.set_current(scene)
         self._simulation.submit(ShowScene(scene))
-        self.hub.publish(CurrentScene(None if scene is None else self._records[scene]))
+        self._hub.publish(CurrentScene(None if scene is None else self._records[scene]))
 
     def _check_names(self, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
         if names is not None and not 1 <= len(names) <= MAX_OBJECTS:
@@ -328,11 +372,11 @@ class Scenes:
         if len(set(names or ())) != len(names or ()):
             raise InvalidInput("list of objects", ", ".join(names or ()), "without repetition")
         for name in names or ():
-            self.library.check(name)
+            self._library.check(name)
         return names
 
     def _check_free(self, scene: str) -> None:
-        by = self.holder(scene)
+        by = self._holder(scene)
         if by is not None:
             raise SceneHeld(by)
 
@@ -346,7 +390,7 @@ class Scenes:
             with self._lock:
                 if event.record.id in self._records:
                     self._records[event.record.id] = event.record
-        self.hub.publish(event)
+        self._hub.publish(event)
 
 
 def _posed(names: tuple[str, ...] | None, poses: tuple[tuple[str, Pose], ...]) -> tuple[str, ...]:

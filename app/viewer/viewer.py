@@ -140,15 +140,15 @@ class Viewer:
         estimate = EstimatePanel(server, table, EstimateNodes(server, library, table.names))
         self._goal_panel = GoalPanel(server, library, self._goals, self._commands, self._run_command)
         episode = EpisodePanel(server, table, EpisodeNodes(server, library, table.names), estimate.forget)
-        push = PushPanel(server, library, self._predictions, self._runner.act, self._run_command)
+        push = PushPanel(server, library, self._predictions, self._runner.scenes.act, self._run_command)
         return self.pages.neural, self.pages, estimate, self._goal_panel, episode, push
 
     def _add_client(self, client: viser.ClientHandle) -> None:
-        self._runner.watch_frames(1)
+        self._runner.scenes.watch_frames(1)
         self.pages.add_client(client)
 
     def _remove_client(self, client: viser.ClientHandle) -> None:
-        self._runner.watch_frames(-1)
+        self._runner.scenes.watch_frames(-1)
         self.pages.remove_client(client)
         self._memory.wake(_AFTER_LEAVING_S)
 
@@ -156,8 +156,8 @@ class Viewer:
         self._playback.note(CurrentScene(self._current_record()))
 
     def _current_record(self) -> SceneRecord | None:
-        current = self._runner.current
-        return None if current is None else self._runner.scene(current)
+        current = self._runner.scenes.current
+        return None if current is None else self._runner.scenes.get(current)
 
     def _add_controls(self, server: PrivateViser) -> None:
         gui = server.gui
@@ -177,7 +177,7 @@ class Viewer:
 
         def move(scene: str) -> None:
             try:
-                self._runner.edit_scene(scene, poses=((name, pose),), settle=True)
+                self._runner.scenes.edit(scene, poses=((name, pose),), settle=True)
             except OsfError:
                 self._show_current()
                 raise
@@ -186,10 +186,10 @@ class Viewer:
 
     def _move_light(self, light: Light, client: Client) -> None:
         """The light was let go. Called on viser's loop."""
-        self._commands.submit(self._on_current, lambda scene: self._runner.edit_scene(scene, light=light), client)
+        self._commands.submit(self._on_current, lambda scene: self._runner.scenes.edit(scene, light=light), client)
 
     def _on_current(self, command: Callable[[str], object], client: Client) -> None:
-        scene = self._runner.current
+        scene = self._runner.scenes.current
         if scene is not None:
             self._run_command(lambda: command(scene), client)
 
@@ -211,7 +211,7 @@ class Viewer:
 
     def _update_gizmos(self) -> None:
         """Objects can be dragged while no job holds the scene and no goal is being composed."""
-        current = self._runner.current
+        current = self._runner.scenes.current
         is_free = current is not None and self._runner.jobs.holder(current) is None
         self._drawing.show_gizmos(self._wants_gizmos.value and is_free and not self._goal_panel.is_composing)
 

@@ -104,7 +104,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     settings, names, method = settings_of(params["settings"]), tuple(params["names"]), method_of(params)
     yield EpisodeProgress(0, 0, "Loading fields, half a minute the first time")
     models = _models(method, names, place)
-    world = RemoteWorld(place.orders.ask, params["scene"], place.folder)
+    world = RemoteWorld(place.orders.ask, params["scene"])
     goal, start = params["goal"], world.truth()
     target = None if goal["truth"] is None else SceneState(names, _poses(goal["truth"], names), start.light, None)
     inputs, rng = place.folder / INPUTS, stream_rng(params["seed"], Stream.EPISODE)

@@ -2,40 +2,33 @@
 
 from __future__ import annotations
 
-import io
-import shutil
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
 
-from app.processes.messages.scene_messages import Act, ObserveScene, SceneRecord, TakeView
+from app.processes.messages.scene_messages import Act, JobCommand, ObservedScene, ObserveScene, SceneRecord, TakeView
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.geometry.workspace import check_action
-from osfcore.io.observation_file import read_observation
 
-_FOLDER = ".seen"
-Ask = Callable[[Act | ObserveScene | TakeView], Any]
+Ask = Callable[[JobCommand], Any]
 
 
 class RemoteWorld:
     """A scene of the service, by way of the process that simulates it.
 
-    Images come as the cameras' 8-bit PNGs, as a robot's would.
+    The service stands in between: it stores each push, and lets a job change no scene but its own.
 
     Args:
         ask: has something done with the scene, and waits for the answer.
         scene: identifier.
-        folder: for images on their way; exists.
     """
 
-    def __init__(self, ask: Ask, scene: str, folder: Path) -> None:
-        self._ask, self._scene, self._folder = ask, scene, folder
+    def __init__(self, ask: Ask, scene: str) -> None:
+        self._ask, self._scene = ask, scene
         self.record: SceneRecord | None = None  # the truth of the last moment; for reports, not for estimates
 
     def reset(self, seed: int) -> Observation:
@@ -53,12 +46,9 @@ class RemoteWorld:
         Raises:
             ProcessUnavailable: if the simulation is not there now.
         """
-        place = self._folder / _FOLDER
-        shutil.rmtree(place, ignore_errors=True)
-        self.record = self._ask(ObserveScene(self._scene, place, goal=False, masks=masks))
-        observation = read_observation(place)
-        shutil.rmtree(place, ignore_errors=True)
-        return observation
+        seen: ObservedScene = self._ask(ObserveScene(self._scene, goal=False, masks=masks))
+        self.record = seen.record
+        return seen.observation
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
         """Hold the pusher velocity (vx, vy, 0) [m/s] for 0.2 s.
@@ -70,8 +60,7 @@ class RemoteWorld:
         self.record = self._ask(Act(self._scene, (check_action(action),)))
 
     def close(self) -> None:
-        """Remove images on their way. Calling it again does nothing."""
-        shutil.rmtree(self._folder / _FOLDER, ignore_errors=True)
+        """Do nothing: the scene is the page's."""
 
     def truth(self) -> SceneState:
         """Where everything truly was, at the last moment that was told; for reports, never for the loop."""
@@ -81,6 +70,4 @@ class RemoteWorld:
 
     def photo(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
         """What a camera would see now, the pusher included, at its size."""
-        data = self._ask(TakeView(self._scene, camera))
-        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-            return np.asarray(image.convert("RGB"), np.float32) / 255
+        return self._ask(TakeView(self._scene, camera)).astype(np.float32) / 255

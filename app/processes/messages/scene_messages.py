@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,7 +10,7 @@ from jaxtyping import Float, UInt8
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import Observation, SceneState
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -130,7 +129,7 @@ class TakeImage:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TakeView:
-    """What any camera would see, as PNG. Answered by bytes."""
+    """What any camera would see. Answered by its 8-bit RGB image."""
 
     id: str
     camera: Camera
@@ -149,19 +148,30 @@ class TakeMask:
 
 @dataclass(frozen=True, slots=True)
 class ObserveScene:
-    """What the robot sees of a scene now, as an observation folder. Answered by the SceneRecord that was observed.
+    """What the robot sees of a scene now. Answered by an ObservedScene.
 
     Attributes:
         id: of the scene.
-        folder: to write; nothing in it tells the truth.
         goal: the goal camera's view alone, without the pusher.
         masks: whether to tell each object's visible pixels.
     """
 
     id: str
-    folder: Path
     goal: bool
     masks: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ObservedScene:
+    """A scene and what the robot sees of it.
+
+    Attributes:
+        record: the scene when it was observed.
+        observation: images have the 256 values of a camera's; nothing in it says where objects truly are.
+    """
+
+    record: SceneRecord
+    observation: Observation
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -233,6 +243,8 @@ Command = (
     | ShowScene
     | WatchFrames
 )
+
+JobCommand = Act | ObserveScene | TakeView  # what a job may do with the scene that it drives
 
 
 # Events of the simulation.

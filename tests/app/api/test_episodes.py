@@ -61,7 +61,7 @@ def interrupted(restarted):
     """The client, the episode's name and its folder."""
     client, episode = restarted
     runner = client.app.state.services.runner
-    folder, record = runner.jobs.folder(episode["id"]), runner.scene(episode["scene"])
+    folder, record = runner.jobs.folder(episode["id"]), runner.scenes.get(episode["scene"])
     write_png(folder / FRAMES_FOLDER / "000.png", np.full((HEIGHT, WIDTH, 3), 99, np.uint8))
     millimetres = dict.fromkeys(episode["objects"], 1.5)
     step = {

@@ -89,7 +89,7 @@ def test_a_preset_becomes_the_scene_that_is_shown_and_its_goal(service, services
     one = preset("pair")
     assert made.status_code == 201
     scene, goal = made.json()["scene"], made.json()["goal"]
-    assert services.runner.current == scene["id"]
+    assert services.runner.scenes.current == scene["id"]
     assert [entry["name"] for entry in scene["objects"]] == list(one.objects)
     np.testing.assert_allclose(scene["light"]["position"], one.light.position, atol=1e-9)
     assert (goal["scene"], goal["name"], goal["source"]) == (scene["id"], one.title, "composed")
@@ -111,7 +111,7 @@ def test_the_same_preset_is_its_table_put_back(service, services, made):
     assert [again[part]["id"] for part in ("scene", "goal")] == [scene, made.json()["goal"]["id"]]
     np.testing.assert_allclose(again["scene"]["light"]["position"], preset("pair").light.position, atol=1e-9)
     check_same_tables(again, made.json())
-    assert services.runner.current == scene
+    assert services.runner.scenes.current == scene
 
 
 def test_a_table_that_is_the_presets_already_becomes_its_own_until_it_is_touched(service, services):
@@ -120,7 +120,7 @@ def test_a_table_that_is_the_presets_already_becomes_its_own_until_it_is_touched
     touched, fresh = (service.post("/api/scenes", json=asked).json()["id"] for _ in range(2))
     service.patch(f"/api/scenes/{touched}", json={"light": {"position": [0, 0, 1]}})
     made = service.post("/api/presets/pair").json()
-    assert made["scene"]["id"] == services.runner.current == fresh
+    assert made["scene"]["id"] == services.runner.scenes.current == fresh
     service.delete(f"/api/goals/{made['goal']['id']}")
     for scene in (touched, fresh):
         service.delete(f"/api/scenes/{scene}")

@@ -230,6 +230,6 @@ def test_a_light_below_the_table_is_refused():
 
 
 def test_a_scene_knows_whether_it_is_shown(services, scene):
-    record = services.runner.scene(scene["id"])
+    record = services.runner.scenes.get(scene["id"])
     assert scene_out(services, record).is_current
     assert scene_out(services, record).objects[0].label == "Cracker box"

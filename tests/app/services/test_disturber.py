@@ -25,12 +25,9 @@ def disturb(service, scene):
     return disturb
 
 
-def seen(services, scene, tmp_path):
+def seen(services, scene):
     """What the robot's cameras report."""
-    from osfcore.io.observation_file import read_observation
-
-    services.runner.observe(scene["id"], tmp_path / "seen", goal=False, masks=False)
-    return read_observation(tmp_path / "seen").images
+    return services.runner.scenes.observe(scene["id"], goal=False, masks=False).observation.images
 
 
 def test_a_turned_lamp_is_as_far_away_as_is_told(disturb, scene):
@@ -52,40 +49,40 @@ def test_one_object_is_nudged_by_as_much_as_is_told(disturb, scene):
     assert shifts[moved] == pytest.approx(0.055, abs=0.03)
 
 
-def test_dimming_and_covering_change_what_cameras_see_until_asked_again(disturb, scene, services, tmp_path):
-    before = seen(services, scene, tmp_path)
+def test_dimming_and_covering_change_what_cameras_see_until_asked_again(disturb, scene, services):
+    before = seen(services, scene)
     assert "45 %" in disturb("dim light")["text"]
-    np.testing.assert_allclose(seen(services, scene, tmp_path), 0.45 * before, atol=0.01)
+    np.testing.assert_allclose(seen(services, scene), 0.45 * before, atol=0.01)
     text = disturb("cover camera")["text"]
-    dark = [view for view, image in enumerate(seen(services, scene, tmp_path)) if image.max() == 0]
+    dark = [view for view, image in enumerate(seen(services, scene)) if image.max() == 0]
     assert text == f"Camera {dark[0]} is covered."
     assert len(dark) == 1
     disturb("cover camera")
     disturb("dim light")
-    np.testing.assert_array_equal(seen(services, scene, tmp_path), before)
+    np.testing.assert_array_equal(seen(services, scene), before)
 
 
-def test_putting_the_scene_back_ends_it(disturb, service, scene, services, tmp_path):
-    before = seen(services, scene, tmp_path)
+def test_putting_the_scene_back_ends_it(disturb, service, scene, services):
+    before = seen(services, scene)
     disturb("dim light")
     service.post(f"/api/scenes/{scene['id']}/reset")
-    np.testing.assert_array_equal(seen(services, scene, tmp_path), before)
+    np.testing.assert_array_equal(seen(services, scene), before)
     assert "45 %" in disturb("dim light")["text"]  # not undone: it was over already
 
 
-def test_the_end_of_an_episode_ends_it(disturb, scene, services, tmp_path):
+def test_the_end_of_an_episode_ends_it(disturb, scene, services):
     jobs = services.runner.jobs
-    before = seen(services, scene, tmp_path)
+    before = seen(services, scene)
     disturb("dim light")
     episode = jobs.submit("episode", {"scene": scene["id"]})
     jobs.cancel(episode.id)
-    until(lambda: np.array_equal(seen(services, scene, tmp_path), before))
+    until(lambda: np.array_equal(seen(services, scene), before))
     until(lambda: jobs.get(episode.id).is_finished)
     jobs.forget(episode.id)
 
 
 def test_what_does_not_exist_is_told(services, service, scene):
     with pytest.raises(UnknownName):
-        Disturber(services.runner, np.random.default_rng(0)).disturb("nobody", "dim light")
+        Disturber(services.runner.scenes, np.random.default_rng(0)).disturb("nobody", "dim light")
     assert service.post("/api/scenes/nobody/disturbances", json={"kind": "dim light"}).status_code == 404
     assert service.post(f"/api/scenes/{scene['id']}/disturbances", json={"kind": "shout"}).status_code == 422

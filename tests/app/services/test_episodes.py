@@ -209,10 +209,10 @@ def test_what_cannot_be_is_refused_and_leaves_nothing(episodes, runner, tmp_path
 
 
 def test_without_a_scene_or_without_fields_there_is_nothing_to_do(episodes, runner):
-    runner.names = (BOX, "spoon")
+    runner.scenes.names = (BOX, "spoon")
     with pytest.raises(MissingFields):
         episodes.start(AskedEpisode(goal="made"))
-    runner.current = None
+    runner.scenes.current = None
     with pytest.raises(NoTable):
         episodes.start(AskedEpisode(goal="made"))
 
@@ -397,7 +397,7 @@ def test_an_episode_is_followed_to_its_end(service, services, done):
     assert first["estimate_off_mm"][MUSTARD] < 10
     assert set(first["seconds"]) == {"first", "goal"} or set(first["seconds"]) == {"first"}
     assert episode["files"] == [name for name in FILES if name != CLIP_FILE]
-    now = services.runner.scene(scene["id"])
+    now = services.runner.scenes.get(scene["id"])
     assert now.time_s == pytest.approx(0.4)
     assert not np.array_equal(now.state.pusher, scene["pusher"]["position"])
     listed = service.get("/api/episodes").json()["episodes"]
@@ -537,7 +537,7 @@ def test_poses_become_the_image_that_the_method_as_published_wants(episodes, run
         asked.append(command)
         return ComposedGoal(PNG, POSES)
 
-    monkeypatch.setattr(runner, "compose", compose, raising=False)
+    monkeypatch.setattr(runner.scenes, "compose", compose, raising=False)
     job = episodes.start(AskedEpisode(scene="s", poses=POSES, method="paper"))
     assert [(command.id, command.poses) for command in asked] == [("s", POSES)]
     goal = job.params["goal"]

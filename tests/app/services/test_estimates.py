@@ -11,6 +11,7 @@ import pytest
 from app.jobs.folders import JobFolders
 from app.jobs.job import Job, JobPage
 from app.jobs.kinds.estimates import STATE
+from app.processes.messages.scene_messages import ObservedScene
 from app.services.estimates import Asked, Estimates, NoImages, NoPrior, NoScene, Uploaded, errors_of, examine
 from app.services.fields import FieldCatalogue, MissingFields
 from app.storage.database import now_utc
@@ -84,14 +85,29 @@ class Jobs(JobFolders):
         return ended
 
 
+class Scenes:
+    """One scene, whose camera images are grey."""
+
+    def __init__(self):
+        self.current, self.names = "s", (BOX, MUSTARD)
+
+    def get(self, scene):
+        if scene != "s":
+            raise UnknownName("scene", scene, ["s"])
+        return replace(record(), id="s", state=believed(self.names).state)
+
+    def observe(self, scene, *, goal, masks):
+        observation = seen(self.names, views=1 if goal else 4, masks=masks)
+        return ObservedScene(replace(self.get(scene), revision=7), observation)
+
+
 class Runner:
-    """A service with one scene, whose camera images are grey."""
+    """A service with one scene."""
 
     def __init__(self, data_dir, library):
         self.jobs = Jobs(data_dir)
         self.library = library
-        self.current = "s"
-        self.names = (BOX, MUSTARD)
+        self.scenes = Scenes()
         self.storage = StorageMeter(data_dir)
 
     def submit_job(self, kind, params):
@@ -99,15 +115,6 @@ class Runner:
 
     def submit_with_inputs(self, kind, params, inputs):
         return self.jobs.submit(kind, params, inputs)
-
-    def scene(self, scene):
-        if scene != "s":
-            raise UnknownName("scene", scene, ["s"])
-        return replace(record(), id="s", state=believed(self.names).state)
-
-    def observe(self, scene, folder, *, goal, masks):
-        write_observation(folder, seen(self.names, views=1 if goal else 4, masks=masks))
-        return replace(self.scene(scene), revision=7)
 
 
 @pytest.fixture
@@ -177,7 +184,7 @@ def test_later_frames_and_goals_begin_with_the_latest_estimate_of_the_scene(esti
     runner.jobs.finish(runner.jobs.get(goal.id))
     with pytest.raises(UnknownName, check=about("estimate")):
         estimates.of_scene(Asked("next", prior="x"))
-    runner.names = (MUSTARD,)
+    runner.scenes.names = (MUSTARD,)
     with pytest.raises(InvalidInput, check=about("objects")):
         estimates.of_scene(Asked("next"))
 
@@ -187,10 +194,10 @@ def test_scenes_that_cannot_be_estimated_are_told(estimates, runner, tmp_path):
         estimates.of_scene(Asked(), "t")
     with pytest.raises(InvalidInput, check=about("seed")):
         estimates.of_scene(Asked(seed=-1))
-    runner.names = (BOX, "spoon")
+    runner.scenes.names = (BOX, "spoon")
     with pytest.raises(MissingFields):
         estimates.of_scene(Asked())
-    runner.current = None
+    runner.scenes.current = None
     with pytest.raises(NoScene):
         estimates.of_scene(Asked())
     assert left_over(tmp_path) == []

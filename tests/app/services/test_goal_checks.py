@@ -32,10 +32,10 @@ def scene(key, *names):
 SCENES = {"s": scene("s", "x", "y"), "t": scene("t", "z")}
 
 
-class Runner:
+class Scenes:
     current = "s"
 
-    def scene(self, key):
+    def get(self, key):
         if key not in SCENES:
             raise UnknownName("scene", key, SCENES)
         return SCENES[key]
@@ -89,7 +89,7 @@ def fields():
 
 @pytest.fixture
 def checks(goals, link, fields):
-    return GoalChecks(Runner(), fields, goals, link, lambda: LABELS)
+    return GoalChecks(Scenes(), fields, goals, link, lambda: LABELS)
 
 
 @pytest.mark.parametrize(
@@ -155,6 +155,6 @@ def test_without_a_table_a_goal_or_a_field_there_is_nothing_to_compare(checks, m
         checks.check("none")
     with pytest.raises(MissingFields, check=about("z")):
         checks.check("photo", "t")
-    monkeypatch.setattr(Runner, "current", None)
+    monkeypatch.setattr(Scenes, "current", None)
     with pytest.raises(NoTable):
         checks.check("photo")

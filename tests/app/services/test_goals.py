@@ -54,17 +54,17 @@ class Runner:
     def __init__(self):
         self.hub, self.told, self.commands = Hub(), [], []
         self.hub.subscribe(self.told.append)
-        self.current, self.error = "s", None
+        self.scenes, self.current, self.error = self, "s", None
         self.storage = StorageMeter(Path())
         self.start = (("x", at(0.0)), ("y", at(0.2)))
 
-    def scene(self, scene):
+    def get(self, scene):
         if scene != "s":
             raise UnknownName("scene", scene, ["s"])
         return replace(record(), id=scene)
 
     def compose(self, command):
-        self.scene(command.id)
+        self.get(command.id)
         if self.error is not None:
             raise self.error
         self.commands.append(command)
@@ -219,7 +219,7 @@ def test_a_goal_that_cannot_be_made_is_told_and_not_kept(goals, runner, error):
 
 def test_without_a_scene_there_is_nothing_to_make_a_goal_of(goals, runner):
     for scene, kind in (("t", UnknownName), (None, NoTable)):
-        runner.current = None
+        runner.scenes.current = None
         for call in (
             lambda scene=scene: goals.compose(scene, (("x", at(0.1)),), "A"),
             lambda scene=scene: goals.draw(scene, 0, None, "A"),

@@ -31,7 +31,7 @@ class Link:
 
 
 def asking(link, current="s", fields=STATE.names):
-    return Predictions(SimpleNamespace(current=current, scene=lambda _: RECORD), lambda: fields, link)
+    return Predictions(SimpleNamespace(current=current, get=lambda _: RECORD), lambda: fields, link)
 
 
 def test_orders_are_passed_on_with_a_key():

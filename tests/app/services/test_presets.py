@@ -1,6 +1,7 @@
 import contextlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -75,7 +76,8 @@ class Service:
 
     def __init__(self, error=None):
         self.error, self.made, self.goals, self.shown = error, [], [], None
-        self.all = self.scenes = tuple  # nothing is there already
+        self.all = tuple  # nothing is there already
+        self.scenes = SimpleNamespace(all=tuple, create=self.create_scene, activate=self.activate)
 
     def create_scene(self, **asked):
         self.made.append(asked)

@@ -61,8 +61,8 @@ def simulation_pid():
 
 def test_the_first_start_shows_a_scene_by_itself(open_runner):
     runner = open_runner()
-    until(lambda: runner.current is not None)
-    (record,) = runner.scenes()
+    until(lambda: runner.scenes.current is not None)
+    (record,) = runner.scenes.all()
     assert (record.seed, len(record.state.names)) == (0, 3)
     until(lambda: any(isinstance(event, CurrentScene) for event in runner.events))
 
@@ -71,33 +71,33 @@ def test_the_first_start_shows_a_scene_by_itself(open_runner):
 def test_the_first_scene_is_the_one_that_is_wished_for_where_its_objects_are_there(open_runner, data_dir):
     light = Light.from_angles(1.0, 0.5)
     runner = open_runner(DemoScene((BOX,), 5, light))
-    until(lambda: runner.current is not None)
-    (record,) = runner.scenes()
+    until(lambda: runner.scenes.current is not None)
+    (record,) = runner.scenes.all()
     assert (record.seed, record.state.names) == (5, (BOX,))
     assert record.state.light.angle_to(light) < 1e-6
     runner.delete_scene(record.id)
     runner = open_runner(DemoScene((BOX, "nowhere"), 5, light))
-    until(lambda: runner.current is not None)
-    assert runner.scenes()[0].seed == 0
+    until(lambda: runner.scenes.current is not None)
+    assert runner.scenes.all()[0].seed == 0
 
 
 def test_without_objects_there_is_no_scene_until_some_come(open_runner, data_dir, tmp_path):
     shutil.move(data_dir / "objects", tmp_path / "later")
     runner = open_runner()
     runner.ensure_demo_scene()
-    assert runner.scenes() == ()
+    assert runner.scenes.all() == ()
     shutil.move(tmp_path / "later", data_dir / "objects")
     runner.ensure_demo_scene()
-    until(runner.scenes)
+    until(runner.scenes.all)
 
 
 @pytest.mark.slow
 def test_everything_is_there_after_a_restart(open_runner):
     runner = open_runner(demo_scene=False)
-    first = runner.create_scene(names=(BOX,), seed=3)
-    runner.create_scene(count=2, seed=4)
-    moved = runner.act(first.id, [(0.1, 0.1, 0.0)] * 2)
-    runner.activate(first.id)
+    first = runner.scenes.create(names=(BOX,), seed=3)
+    runner.scenes.create(count=2, seed=4)
+    moved = runner.scenes.act(first.id, [(0.1, 0.1, 0.0)] * 2)
+    runner.scenes.activate(first.id)
     again = open_runner()
     assert again.current == first.id
     assert [record.seed for record in again.scenes()] == [3, 4]
@@ -111,21 +111,21 @@ def test_everything_is_there_after_a_restart(open_runner):
 @pytest.mark.slow
 def test_a_dying_simulation_is_told_and_the_scenes_live_on(open_runner):
     runner = open_runner(demo_scene=False)
-    scene = runner.create_scene(names=(BOX,), seed=3)
-    until(lambda: runner.simulation_status == "ready")
+    scene = runner.scenes.create(names=(BOX,), seed=3)
+    until(lambda: runner.scenes.status == "ready")
     pid = simulation_pid()
     os.kill(pid, signal.SIGKILL)
     until(lambda: simulation_pid() not in (0, pid))
     until(lambda: any(isinstance(event, Notice) and event.level == "error" for event in runner.events))
-    until(lambda: runner.simulation_status == "ready")
-    assert runner.act(scene.id, [(0.1, 0, 0)]).revision > scene.revision
+    until(lambda: runner.scenes.status == "ready")
+    assert runner.scenes.act(scene.id, [(0.1, 0, 0)]).revision > scene.revision
 
 
 def test_scenes_have_a_limit(open_runner):
     runner = open_runner(demo_scene=False, max_scenes=1)
-    runner.create_scene(names=(BOX,))
+    runner.scenes.create(names=(BOX,))
     with pytest.raises(TooManyScenes):
-        runner.create_scene(names=(BOX,))
+        runner.scenes.create(names=(BOX,))
 
 
 def test_the_limit_holds_for_scenes_made_at_the_same_time(open_runner):
@@ -133,30 +133,30 @@ def test_the_limit_holds_for_scenes_made_at_the_same_time(open_runner):
 
     def make(_):
         try:
-            return runner.create_scene(names=(BOX,))
+            return runner.scenes.create(names=(BOX,))
         except TooManyScenes:
             return None
 
     with ThreadPoolExecutor(8) as executor:
         made = [record for record in executor.map(make, range(8)) if record is not None]
-    assert len(made) == len(runner.scenes()) == 2
+    assert len(made) == len(runner.scenes.all()) == 2
 
 
 @pytest.mark.slow
 def test_a_busy_simulation_is_not_taken_for_a_hanging_one(open_runner):
     """Each answer comes in time, the last one long after the limit for one answer."""
     runner = open_runner(demo_scene=False)
-    scene = runner.create_scene(names=(BOX,), seed=3)
+    scene = runner.scenes.create(names=(BOX,), seed=3)
     single = time.monotonic()
-    asyncio.run(runner.image(TakeImage(scene.id, "0", 700)))
+    asyncio.run(runner.scenes.image(TakeImage(scene.id, "0", 700)))
     single = time.monotonic() - single
     limit_s = max(3 * single, 2.0)
     runner = open_runner(demo_scene=False, stage_timeout_s=limit_s)
-    until(lambda: runner.simulation_status == "ready")
+    until(lambda: runner.scenes.status == "ready")
     pid, count = simulation_pid(), min(int(2 * limit_s / single), 60)
 
     async def many():
-        return await asyncio.gather(*(runner.image(TakeImage(scene.id, "1", 700 + k)) for k in range(count)))
+        return await asyncio.gather(*(runner.scenes.image(TakeImage(scene.id, "1", 700 + k)) for k in range(count)))
 
     images = asyncio.run(many())
     assert len({*images}) == count
@@ -165,10 +165,10 @@ def test_a_busy_simulation_is_not_taken_for_a_hanging_one(open_runner):
 
 def test_an_image_that_many_ask_for_at_once_is_made_once(open_runner):
     runner = open_runner(demo_scene=False)
-    scene = runner.create_scene(names=(BOX,), seed=3)
+    scene = runner.scenes.create(names=(BOX,), seed=3)
 
     async def many():
-        return await asyncio.gather(*(runner.image(TakeImage(scene.id, "2", 256)) for _ in range(10)))
+        return await asyncio.gather(*(runner.scenes.image(TakeImage(scene.id, "2", 256)) for _ in range(10)))
 
     first, *others = asyncio.run(many())
     assert all(other is first for other in others)
@@ -176,16 +176,16 @@ def test_an_image_that_many_ask_for_at_once_is_made_once(open_runner):
 
 def test_changes_are_told_and_refusals_are_not(open_runner):
     runner = open_runner(demo_scene=False)
-    scene = runner.create_scene(names=(BOX,), seed=3)
+    scene = runner.scenes.create(names=(BOX,), seed=3)
     runner.events.clear()
     with pytest.raises(InvalidInput):
-        runner.act(scene.id, [(9, 0, 0)])
+        runner.scenes.act(scene.id, [(9, 0, 0)])
     with pytest.raises(InvalidInput, check=about("objects")):
-        runner.edit_scene(scene.id, poses=((BOX, Pose.identity()), (BOX, Pose.identity())))
+        runner.scenes.edit(scene.id, poses=((BOX, Pose.identity()), (BOX, Pose.identity())))
     with pytest.raises(UnknownName):
-        runner.edit_scene("none", light=Light(np.array([0, 0, 1.0])))
+        runner.scenes.edit("none", light=Light(np.array([0, 0, 1.0])))
     assert not [event for event in runner.events if isinstance(event, SceneChanged)]
-    runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0])))
+    runner.scenes.edit(scene.id, light=Light(np.array([0, 0, 1.0])))
     (change,) = [event for event in runner.events if isinstance(event, SceneChanged)]
     assert np.allclose(change.record.state.light.position, [0, 0, 1])
 
@@ -193,14 +193,14 @@ def test_changes_are_told_and_refusals_are_not(open_runner):
 @pytest.mark.slow
 def test_hands_stay_off_a_scene_that_a_job_uses(open_runner):
     runner = open_runner(demo_scene=False)
-    scene = runner.create_scene(names=(BOX,), seed=3)
+    scene = runner.scenes.create(names=(BOX,), seed=3)
     job = runner.jobs.submit(LONG[0], dict(LONG[1]))
     until(lambda: runner.jobs.get(job.id).done > 0)
     runner.jobs.change(job.id, {"scene": scene.id})
     for command in (
-        lambda: runner.act(scene.id, [(0.1, 0, 0)]),
-        lambda: runner.reset_scene(scene.id),
-        lambda: runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0]))),
+        lambda: runner.scenes.act(scene.id, [(0.1, 0, 0)]),
+        lambda: runner.scenes.reset(scene.id),
+        lambda: runner.scenes.edit(scene.id, light=Light(np.array([0, 0, 1.0]))),
     ):
         with pytest.raises(SceneHeld):
             command()
@@ -210,7 +210,7 @@ def test_hands_stay_off_a_scene_that_a_job_uses(open_runner):
 @pytest.mark.parametrize("state", ["queued", "running", "paused"])
 def test_a_scene_that_a_live_job_needs_cannot_be_deleted_until_it_is_cancelled(open_runner, state):
     runner = open_runner(demo_scene=False)
-    scene = runner.create_scene(names=(BOX,), seed=3)
+    scene = runner.scenes.create(names=(BOX,), seed=3)
     busy = runner.jobs.submit(LONG[0], dict(LONG[1]))
     until(lambda: runner.jobs.get(busy.id).done > 0)
     needs = busy
@@ -220,13 +220,13 @@ def test_a_scene_that_a_live_job_needs_cannot_be_deleted_until_it_is_cancelled(o
         runner.jobs.change(busy.id, {"scene": scene.id})
     if state == "paused":
         runner.jobs.pause(busy.id)
-        runner.edit_scene(scene.id, light=Light(np.array([0, 0, 1.0])))  # hands may move things meanwhile
+        runner.scenes.edit(scene.id, light=Light(np.array([0, 0, 1.0])))  # hands may move things meanwhile
     with pytest.raises(SceneNeeded):
         runner.delete_scene(scene.id)
-    assert runner.scene(scene.id).id == scene.id
+    assert runner.scenes.get(scene.id).id == scene.id
     runner.jobs.cancel(needs.id)
     runner.delete_scene(scene.id)
-    assert runner.scenes() == ()
+    assert runner.scenes.all() == ()
 
 
 def test_a_job_is_not_queued_for_a_scene_that_was_deleted_meanwhile(open_runner):
@@ -241,12 +241,12 @@ def test_a_job_is_not_queued_for_a_scene_that_was_deleted_meanwhile(open_runner)
 def test_an_image_is_made_once_for_each_revision(open_runner):
 
     runner = open_runner(demo_scene=False)
-    scene = runner.create_scene(names=(BOX,), seed=3)
+    scene = runner.scenes.create(names=(BOX,), seed=3)
     command = TakeImage(scene.id, "0", 64)
-    first = asyncio.run(runner.image(command))
-    assert asyncio.run(runner.image(command)) is first
-    runner.edit_scene(scene.id, light=Light(np.array([0.0, 1.0, 0.2])))
-    second = asyncio.run(runner.image(command))
+    first = asyncio.run(runner.scenes.image(command))
+    assert asyncio.run(runner.scenes.image(command)) is first
+    runner.scenes.edit(scene.id, light=Light(np.array([0.0, 1.0, 0.2])))
+    second = asyncio.run(runner.scenes.image(command))
     assert second != first
 
 
@@ -314,26 +314,26 @@ def test_a_scene_that_cannot_be_stored_is_nowhere(open_runner, monkeypatch):
         "app.services.scenes.ProcessClient", lambda *_, **__: simulations.append(PlayedSimulation()) or simulations[-1]
     )
     runner = open_runner(demo_scene=False)
-    shown = runner.create_scene(names=(BOX,), seed=3)
+    shown = runner.scenes.create(names=(BOX,), seed=3)
     runner.events.clear()
     with full_disk(), pytest.raises(CannotStore):
-        runner.create_scene(names=(BOX,), seed=4)
+        runner.scenes.create(names=(BOX,), seed=4)
     assert simulations[-1].scenes == {shown.id}
-    assert [scene.id for scene in runner.scenes()] == [runner.current] == [shown.id]
+    assert [scene.id for scene in runner.scenes.all()] == [runner.scenes.current] == [shown.id]
     assert (runner.events, runner.unwritten) == ([], 0)
-    assert [scene.id for scene in open_runner(demo_scene=False).scenes()] == [shown.id]
+    assert [scene.id for scene in open_runner(demo_scene=False).scenes.all()] == [shown.id]
 
 
 @pytest.mark.slow
 def test_a_push_that_cannot_be_stored_has_happened_and_is_stored_later(open_runner):
     runner = open_runner(demo_scene=False)
-    scene = runner.create_scene(names=(BOX,), seed=3)
+    scene = runner.scenes.create(names=(BOX,), seed=3)
     with full_disk():
-        moved = runner.act(scene.id, [(0.1, 0, 0)])
-        runner.activate(scene.id)
+        moved = runner.scenes.act(scene.id, [(0.1, 0, 0)])
+        runner.scenes.activate(scene.id)
         assert runner.unwritten == 2
     assert moved.time_s > scene.time_s
-    assert runner.scene(scene.id).time_s == moved.time_s
+    assert runner.scenes.get(scene.id).time_s == moved.time_s
     until(lambda: runner.unwritten == 0)
     again = open_runner(demo_scene=False)
     assert again.scene(scene.id).time_s == moved.time_s
@@ -342,38 +342,38 @@ def test_a_push_that_cannot_be_stored_has_happened_and_is_stored_later(open_runn
 @pytest.mark.slow
 def test_what_a_hand_moves_on_a_full_disk_is_refused_and_undone(open_runner):
     runner = open_runner(demo_scene=False)
-    made = runner.create_scene(names=(BOX,), seed=3, light=Light(np.array([0.0, 0.0, 1.5])))
-    moved = runner.edit_scene(made.id, light=Light(np.array([0.0, 0.5, 1.5])))
+    made = runner.scenes.create(names=(BOX,), seed=3, light=Light(np.array([0.0, 0.0, 1.5])))
+    moved = runner.scenes.edit(made.id, light=Light(np.array([0.0, 0.5, 1.5])))
     lifted = Pose(made.state.pose(BOX).position + np.array([0.0, 0.1, 0.05]), made.state.pose(BOX).quaternion)
     picture = TakeImage(made.id, "0", 64)
 
     def seen():
-        return asyncio.run(runner.image(picture))
+        return asyncio.run(runner.scenes.image(picture))
 
     before = seen()
     for change in (
-        lambda: runner.edit_scene(made.id, light=Light(np.array([0.5, 0.0, 1.5]))),
-        lambda: runner.edit_scene(made.id, poses=((BOX, lifted),)),
-        lambda: runner.reset_scene(made.id),
+        lambda: runner.scenes.edit(made.id, light=Light(np.array([0.5, 0.0, 1.5]))),
+        lambda: runner.scenes.edit(made.id, poses=((BOX, lifted),)),
+        lambda: runner.scenes.reset(made.id),
     ):
         with full_disk(), pytest.raises(CannotStore):
             change()
-        now = runner.scene(made.id)
+        now = runner.scenes.get(made.id)
         assert now.revision > moved.revision
         np.testing.assert_array_equal(now.state.light.position, moved.state.light.position)
         np.testing.assert_allclose(now.state.poses.position, moved.state.poses.position, atol=1e-9)
         assert seen() == before
         assert runner.unwritten == 0
-    again = runner.edit_scene(made.id, light=Light(np.array([0.5, 0.0, 1.5])))
+    again = runner.scenes.edit(made.id, light=Light(np.array([0.5, 0.0, 1.5])))
     assert open_runner(demo_scene=False).scene(made.id).revision == again.revision
 
 
 @pytest.mark.slow
 def test_that_the_database_was_deleted_is_a_problem_with_a_reason(open_runner, data_dir):
     runner = open_runner(demo_scene=False)
-    scene = runner.create_scene(names=(BOX,), seed=3)
+    scene = runner.scenes.create(names=(BOX,), seed=3)
     (data_dir / FILE).unlink()
-    runner.activate(scene.id)
+    runner.scenes.activate(scene.id)
     assert runner.unwritten == 1
     assert FILE in runner.storing_problem()
 

@@ -1,14 +1,13 @@
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
 from app.jobs.kinds.remote_world import RemoteWorld
-from app.processes.messages.scene_messages import Act, ObserveScene, SceneRecord, TakeView
+from app.processes.messages.scene_messages import Act, ObservedScene, ObserveScene, SceneRecord, TakeView
 from osfcore.errors import InvalidInput, NotThere, OsfError
 from osfcore.geometry.cameras import default_cameras, goal_camera
-from osfcore.io.observation_file import write_observation
+from osfcore.io.image_file import to_uint8
 from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 from tests.support.errors import about
@@ -30,13 +29,14 @@ class Stage:
                 for action in command.actions:
                     self.world.act(action)
             case ObserveScene():
-                write_observation(command.folder, self.world.observe(masks=command.masks))
+                return ObservedScene(self.record(command.id), self.world.observe(masks=command.masks))
             case TakeView():
-                image = self.world.render((command.camera,), with_pusher=command.pusher).images[0]
-                pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-                return cv2.imencode(".png", pixels[..., ::-1])[1].tobytes()
+                return to_uint8(self.world.render((command.camera,), with_pusher=command.pusher).images[0])
+        return self.record(command.id)
+
+    def record(self, scene):
         state = self.world.truth()
-        return SceneRecord(command.id, 0, "", SIDE, state, state, self.world.time_s, 1)
+        return SceneRecord(scene, 0, "", SIDE, state, state, self.world.time_s, 1)
 
 
 @pytest.fixture
@@ -48,20 +48,19 @@ def stage(library):
 
 
 @pytest.fixture
-def remote(stage, tmp_path):
-    return RemoteWorld(stage, "s1", tmp_path)
+def remote(stage):
+    return RemoteWorld(stage, "s1")
 
 
 @pytest.mark.parametrize("masks", [False, True])
-def test_what_the_cameras_see_comes_over(remote, stage, tmp_path, masks):
+def test_what_the_cameras_see_comes_over(remote, stage, masks):
     seen, true = remote.observe(masks=masks), stage.world.observe(masks=masks)
-    np.testing.assert_allclose(seen.images, true.images, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(seen.images, true.images, atol=1e-6)
     assert seen.names == true.names
     np.testing.assert_allclose(seen.pusher, true.pusher, atol=1e-12)
     assert (seen.masks is None) == (not masks)
     if masks:
         np.testing.assert_array_equal(seen.masks, true.masks)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_actions_are_done_there(remote, stage):
@@ -94,11 +93,11 @@ def test_a_photo_shows_what_any_camera_sees_with_the_pusher(remote, stage, size)
     assert stage.world.time_s == 0
 
 
-def test_what_the_stage_refuses_is_told(tmp_path):
+def test_what_the_stage_refuses_is_told():
     def refuse(_):
         raise NotThere("scene")
 
-    remote = RemoteWorld(refuse, "s1", tmp_path)
+    remote = RemoteWorld(refuse, "s1")
     for call in (
         remote.observe,
         remote.truth,
@@ -107,7 +106,6 @@ def test_what_the_stage_refuses_is_told(tmp_path):
     ):
         with pytest.raises(OsfError, match="no such scene"):
             call()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_nobody_resets_a_scene_of_the_service(remote):
