@@ -33,9 +33,8 @@ from app.api.paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
 from app.api.problems import named_in_path, problems
 from app.episodes.file_names import REPORT_FILE
 from app.episodes.frames import Part
+from app.episodes.settings import ChosenSettings
 from app.jobs.job import Job
-from app.jobs.kinds.episodes import method_of
-from app.services.episodes import AskedEpisode, defaults, flat
 from osfcore.control.events import CostKind, EpisodeSettings, Matter
 from osfcore.errors import CorruptFile
 from osfcore.paper.method import METHODS, Method
@@ -81,27 +80,13 @@ class EpisodeIn(Input):
     seed: Seed = 0
     settings: SettingsIn = SettingsIn()  # pyright: ignore[reportCallIssue]
 
-    def asked(self) -> AskedEpisode:
-        """What the service's own modules take."""
-        poses = None if self.poses is None else tuple(entry.named_pose() for entry in self.poses)
-        settings = self.settings.given()
-        method: Method = settings.pop("method", "ours")
-        return AskedEpisode(self.scene, self.goal, poses, self.seed, settings, method)
+    def chosen(self) -> ChosenSettings:
+        """Return the settings, as by default where nothing is said.
 
-
-class SettingsOut(BaseModel):
-    """How an episode goes."""
-
-    method: Method
-    steps: int
-    replan_every: int
-    cost: CostKind
-    samples: int
-    horizon: int
-    temperature: float
-    planning: bool
-    acting: bool
-    despite_doubts: bool
+        Raises:
+            InvalidInput: if one means something that the method does not have.
+        """
+        return ChosenSettings.defaults(self.settings.method or "ours").changed(self.settings.given())
 
 
 Bounds = Annotated[list[float], Field(min_length=2, max_length=2, description="Least and most.")]
@@ -120,8 +105,8 @@ class SettingBounds(BaseModel):
 class EpisodeSettingsOut(BaseModel):
     """Defaults and bounds of an episode's settings."""
 
-    defaults: SettingsOut
-    published: SettingsOut = Field(description="Defaults of the method as published.")
+    defaults: ChosenSettings
+    published: ChosenSettings = Field(description="Defaults of the method as published.")
     reached_mm: float = Field(description="Objects as near as this to their goals, as estimated, have arrived [mm].")
     reached_deg: float = Field(description="Likewise for how they are turned [deg].")
     bounds: SettingBounds
@@ -142,7 +127,7 @@ class ServiceSettings(BaseModel):
             horizon=list(HORIZON),
             temperature=list(_TEMPERATURE),
         )
-        ours, published = (SettingsOut(method=method, **defaults(method)) for method in METHODS)
+        ours, published = map(ChosenSettings.defaults, METHODS)
         rule = EpisodeSettings()
         reached_mm, reached_deg = 1000 * rule.reached_m, math.degrees(rule.reached_rad)
         return ServiceSettings(
@@ -196,7 +181,7 @@ class EpisodeOut(ProgressOut):
     goal: str | None = Field(description="Identifier of the goal image; null where poses were given.")
     objects: list[str]
     seed: int
-    settings: SettingsOut
+    settings: ChosenSettings
     done: int = Field(description="Actions executed.")
     total: int = Field(description="Actions at most.")
     stage: Literal["first", "goal", "plan", "act", "next", "search"] | None
@@ -211,7 +196,7 @@ class EpisodeOut(ProgressOut):
 
     @staticmethod
     def of_job(
-        job: Job, name: str, settings: EpisodeSettings, report: dict[str, Any] | None, files: tuple[str, ...]
+        job: Job, name: str, settings: ChosenSettings, report: dict[str, Any] | None, files: tuple[str, ...]
     ) -> EpisodeOut:
         """From the registry's job and what it has written so far.
 
@@ -230,7 +215,7 @@ class EpisodeOut(ProgressOut):
             goal=job.params["goal"]["id"],
             objects=job.params["names"],
             seed=job.params["seed"],
-            settings=SettingsOut(method=method_of(job.params), **flat(settings)),
+            settings=settings,
             done=job.done,
             total=job.total,
             stage=result.get("stage"),
@@ -278,7 +263,8 @@ FoundDep = Annotated[Job, Depends(_known_job)]
 @slow
 def create(services: ServicesDep, body: EpisodeIn, response: Response) -> EpisodeOut:
     """Queue an episode: look, predict, plan, push and look again until the scene is as the goal shows it."""
-    job = services.episodes.start(body.asked())
+    poses = None if body.poses is None else tuple(entry.named_pose() for entry in body.poses)
+    job = services.episodes.start(body.chosen(), body.scene, body.goal, poses, body.seed)
     response.headers["Location"] = f"{router.prefix}/{job.id}"
     return _out(services, job)
 

@@ -25,8 +25,7 @@ from app.processes.photo_process import PhotoRefused
 from app.processes.server import InternalError, OutOfMemory
 from app.services.disturber import NoRoomToNudge
 from app.services.driver import NotDriving
-from app.services.episode_results import NoTrajectory
-from app.services.episodes import EpisodeGoesOn, GoalUnknown, NoGoal
+from app.services.episodes import EpisodeGoesOn, GoalUnknown, NoGoal, NoTrajectory
 from app.services.estimates import NoImages, NoPrior, NoScene
 from app.services.fields import MissingFields, NoPublishedField, NoTrainedField, ShippedField
 from app.services.goals import DraftUnsound, GoalRefused, NoDraft, NoPhoto, NoTable

@@ -13,6 +13,7 @@ from app.api.dependencies import VISITOR_HEADER, ServicesDep, only_the_driver, s
 from app.api.jobs import JobOut
 from app.api.models import Box, Horizon, Identifier, Input, ObjectNames, Samples, Seed, Steps, Visitor
 from app.api.problems import named_in_path, problems
+from app.episodes.settings import ChosenSettings
 from app.services.robot import AskedDrive, CameraNow, RobotNow, State
 from app.storage.database import utc_of
 from osfcore.io.scene_file import CameraJson, camera_to_json
@@ -44,7 +45,8 @@ class RobotEpisodeIn(Input):
             camera: {name: (box[0], box[1], box[2], box[3]) for name, box in of.items()}
             for camera, of in self.boxes.items()
         }
-        return AskedDrive(self.goal, tuple(self.names), boxes, self.seed, self.settings.model_dump(exclude_none=True))
+        settings = ChosenSettings.defaults().changed(self.settings.model_dump(exclude_none=True))
+        return AskedDrive(self.goal, tuple(self.names), boxes, self.seed, settings)
 
 
 class ConfirmationIn(Input):

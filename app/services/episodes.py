@@ -4,40 +4,59 @@ from __future__ import annotations
 
 import itertools
 import shutil
+import threading
+import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from app.episodes.file_names import GOAL_FILE, PREPARED_FILE
+import cv2
+
+from app.episodes.file_names import (
+    ARCHIVE_FILE,
+    CLIP_FILE,
+    CSV_FILE,
+    FRAMES_FOLDER,
+    GOAL_FILE,
+    PREPARED_FILE,
+    RECORDING_FILE,
+    REPORT_FILE,
+    TRAJECTORY_FILE,
+    VIDEO_FILE,
+)
+from app.episodes.frames import Part, part_of, read_frame, read_frames, write_video
+from app.episodes.settings import ChosenSettings
 from app.jobs.job import Job, JobPage
-from app.jobs.kinds.episodes import method_of, settings_of
 from app.processes.messages.scene_messages import ComposeGoal
-from app.services.episode_results import EpisodeResults
 from app.services.examples import Stories
 from app.services.fields import FieldCatalogue
 from app.services.goals import GOAL_SIDE, GoalChecks, Goals, NoTable
 from app.services.runner import Runner
 from app.storage.database import CannotStore
-from app.storage.records import GoalRecord, Poses, poses_to_json
-from osfcore.control.events import EpisodeSettings
-from osfcore.errors import InvalidInput, OsfError, check_seed
+from app.storage.records import Poses, poses_to_json
+from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed, shown
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import unit_quaternion
-from osfcore.io.files import write_atomically
-from osfcore.io.scene_file import camera_to_json
+from osfcore.geometry.states import SceneState
+from osfcore.io.files import file_at_once, read_json, write_atomically
+from osfcore.io.image_file import encode_png
+from osfcore.io.json_codec import Entry, decode
+from osfcore.io.scene_file import StateJson, camera_to_json
 from osfcore.paper.method import Method
-from osfcore.paper.mppi import STEPS, GaussianPlanSettings
 
 KIND, CLIP_KIND = "episode", "clip"
 _MOST_NAMES = 1000  # that a new one is compared with
-_PLAN = ("samples", "horizon", "temperature")
-_FIXED = {  # of the method as published: what it is called, and what it cannot but be
-    "cost": ("cost", "image"),
-    "replan_every": ("actions of each plan", 1),
-    "planning": ("planning", True),
-    "acting": ("acting", True),
-}
+FILES = (REPORT_FILE, CSV_FILE, GOAL_FILE, VIDEO_FILE, CLIP_FILE, RECORDING_FILE, ARCHIVE_FILE)
+THUMBNAIL_PX = 96
+
+
+class NoTrajectory(OsfError):
+    """An episode that cannot be replayed."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "This episode cannot be replayed in 3D: it has not looked at anything yet, or an earlier version ran it."
+        )
 
 
 class NoGoal(OsfError):
@@ -63,28 +82,7 @@ class GoalUnknown(OsfError):
         )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class AskedEpisode:
-    """What to do.
-
-    Attributes:
-        scene: identifier; None for the current one.
-        goal: identifier of a goal image; None where poses are given.
-        poses: where all objects shall be; None where a goal image is named.
-        seed: of the searches.
-        settings: changes of the method's defaults, see `defaults`.
-        method: whose; the one as published looks at the goal as an image alone.
-    """
-
-    scene: str | None = None
-    goal: str | None = None
-    poses: Poses | None = None
-    seed: int = 0
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    method: Method = "ours"
-
-
-class Episodes(EpisodeResults):
+class Episodes:
     """The episodes of one service. Methods that change something block; any thread may call.
 
     Args:
@@ -95,44 +93,56 @@ class Episodes(EpisodeResults):
     """
 
     def __init__(self, runner: Runner, fields: FieldCatalogue, goals: Goals, checks: GoalChecks) -> None:
-        super().__init__(runner)
+        self._runner = runner
+        self._making = threading.Lock()  # of files on demand
         self._fields = fields
         self._goals = goals
         self._checks = checks
 
     # Asking for one
 
-    def start(self, asked: AskedEpisode) -> Job:
-        """Queue an episode.
+    def start(
+        self,
+        settings: ChosenSettings,
+        scene: str | None = None,
+        goal: str | None = None,
+        poses: Poses | None = None,
+        seed: int = 0,
+    ) -> Job:
+        """Queue an episode toward a goal image, or toward poses of all objects.
+
+        Args:
+            settings: how it goes.
+            scene: identifier; None for the current one.
+            goal: identifier of a goal image.
+            poses: where all objects shall be, T_world_object [m] by name.
+            seed: of the searches.
 
         Raises:
             NoTable, UnknownName: if there is no such scene or goal.
             NoGoal: if there is neither goal nor poses, or both.
             MissingFields, NoPublishedField: if an object cannot be recognised.
             GoalRefused: if the goal image does not show the scene's objects, unless doubts are not to matter.
-            InvalidInput: if a setting is out of range, or the poses are not those of the scene's objects.
+            InvalidInput: if the poses are not those of the scene's objects.
             QueueFull: if too many jobs wait.
             StorageFull: if nothing more may be written.
         """
-        check_seed(asked.seed)
-        scene = asked.scene or self._runner.scenes.current
+        check_seed(seed)
+        scene = scene or self._runner.scenes.current
         if scene is None:
             raise NoTable
         names = self._runner.scenes.get(scene).state.names
-        self._fields.require(names, asked.method)
-        settings = nested(asked.settings, asked.method)
-        despite_doubts = settings_of(settings).despite_doubts
-        if asked.goal is not None and asked.poses is None and not despite_doubts:
-            self._checks.require(asked.goal, scene)
+        self._fields.require(names, settings.method)
+        if goal is not None and poses is None and not settings.despite_doubts:
+            self._checks.require(goal, scene)
         with self._runner.jobs.new_inputs() as folder:
             params = {
                 "scene": scene,
-                "title": self._new_name(asked, names),
+                "title": self._new_name(goal, names),
                 "names": list(names),
-                "seed": asked.seed,
-                "method": asked.method,
-                "settings": settings,
-                "goal": self._goal(asked, scene, names, folder),
+                "seed": seed,
+                "settings": settings.to_job(),
+                "goal": self._goal(goal, poses, settings.method, scene, names, folder),
             }
             job = self._runner.submit_with_inputs(KIND, params, folder)
         self._goals.drop_draft()  # what is composed cannot be moved while the episode has the scene
@@ -145,50 +155,43 @@ class Episodes(EpisodeResults):
             InvalidInput: if one is out of range, or another method, or the method as published, which goes as it began.
             WrongJobState: if the episode neither runs nor pauses.
         """
-        own = method_of(job.params)
-        if (method := settings.get("method", own)) != own:
-            raise InvalidInput("method", method, f"{own}, as when the episode began")
-        if own == "paper":
+        now = self.settings(job)
+        if (method := settings.get("method", now.method)) != now.method:
+            raise InvalidInput("method", method, f"{now.method}, as when the episode began")
+        if now.method == "paper":
             raise InvalidInput("change of settings", "asked for", "left out: the method as published goes as it began")
-        given = {key: value for key, value in settings.items() if key != "method"}
-        merged = nested({**flat(self.settings(job)), **given})
-        settings_of(merged)
-        return self._runner.jobs.change(job.id, {"settings": merged})
+        return self._runner.jobs.change(job.id, {"settings": now.changed(settings).to_job()})
 
-    def _goal(self, asked: AskedEpisode, scene: str, names: tuple[str, ...], folder: Path) -> dict[str, Any]:
-        """What the job is told of the goal; a goal image is copied for it."""
-        if (asked.goal is None) == (asked.poses is None):
+    def _goal(
+        self, goal_id: str | None, poses: Poses | None, method: Method, scene: str, names: tuple[str, ...], folder: Path
+    ) -> dict[str, Any]:
+        """Return what the job is given of the goal; a goal image is copied for it."""
+        if (goal_id is None) == (poses is None):
             raise NoGoal
         try:
             folder.mkdir(parents=True)
-            if asked.goal is None:
-                given = _of_all(asked.poses or (), names)
-                if asked.method == "paper":
+            if goal_id is None:
+                given = _of_all(poses or (), names)
+                if method == "paper":
                     return self._rendered(given, scene, folder)
-                poses = poses_to_json(given)
-                return {"id": None, "camera": None, "poses": poses, "truth": poses}
-            goal = self._goals.get(asked.goal)
+                wanted = poses_to_json(given)
+                return {"id": None, "camera": None, "poses": wanted, "truth": wanted}
+            goal = self._goals.get(goal_id)
             shutil.copyfile(self._goals.image(goal.id), folder / GOAL_FILE)
             prepared = None if goal.example is None or goal.scene != scene else Stories().prepared(goal.example)
             if prepared is not None:
                 shutil.copyfile(prepared, folder / PREPARED_FILE)
         except OSError as error:
             raise CannotStore(folder, error.strerror or str(error)) from error
-        if goal.source == "photo" and goal.poses is not None:
-            return self._photographed(goal, goal.poses, asked, scene, names, folder)
+        if goal.source == "photo" and goal.poses is not None:  # nothing is left to be read from its image
+            given = _of_all(goal.poses, names)
+            if method == "paper":
+                return {**self._rendered(given, scene, folder), "id": goal.id}
+            found = poses_to_json(given)
+            return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": found, "truth": found}
         is_known = goal.poses is not None and goal.scene == scene and {name for name, _ in goal.poses} == set(names)
         truth = poses_to_json(goal.poses) if is_known and goal.poses is not None else None
         return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": None, "truth": truth}
-
-    def _photographed(
-        self, goal: GoalRecord, poses: Poses, asked: AskedEpisode, scene: str, names: tuple[str, ...], folder: Path
-    ) -> dict[str, Any]:
-        """A goal whose poses were found in a photograph: nothing is left to be read from its image."""
-        given = _of_all(poses, names)
-        if asked.method == "paper":
-            return {**self._rendered(given, scene, folder), "id": goal.id}
-        found = poses_to_json(given)
-        return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": found, "truth": found}
 
     def _rendered(self, poses: Poses, scene: str, folder: Path) -> dict[str, Any]:
         """A goal that was given as poses, as the image that a method wants which knows of nothing else."""
@@ -209,7 +212,7 @@ class Episodes(EpisodeResults):
         """
         if not job.is_finished:
             raise EpisodeGoesOn
-        if method_of(job.params) == "paper":
+        if self.settings(job).method == "paper":
             raise GoalUnknown
         self.trajectory(job)
         for other in self._runner.jobs.live(CLIP_KIND):
@@ -254,9 +257,9 @@ class Episodes(EpisodeResults):
             raise InvalidInput("name", "empty", "some letters")
         return self._runner.jobs.rename(job.id, name.strip())
 
-    def _new_name(self, asked: AskedEpisode, names: tuple[str, ...]) -> str:
+    def _new_name(self, goal_id: str | None, names: tuple[str, ...]) -> str:
         """That of the goal, or of the objects; with a number if there is one of that name already."""
-        goal = None if asked.goal is None else self._goals.get(asked.goal)
+        goal = None if goal_id is None else self._goals.get(goal_id)
         name = ", ".join(map(self._runner.library.label, names)) if goal is None else goal.name
         taken = {self.name(job) for job in self._runner.jobs.page(_MOST_NAMES, None, KIND).jobs}
         numbered = itertools.chain([name], (f"{name} {n}" for n in itertools.count(2)))
@@ -271,39 +274,114 @@ class Episodes(EpisodeResults):
         return self._runner.jobs.get(episode, KIND)
 
     @staticmethod
-    def settings(job: Job) -> EpisodeSettings:
+    def settings(job: Job) -> ChosenSettings:
         """How an episode goes now."""
-        return settings_of(job.params["settings"])
+        return ChosenSettings.of_job(job.params)
 
+    # What one has left; its job makes it
 
-def nested(settings: Mapping[str, Any], method: Method = "ours") -> dict[str, Any]:
-    """Settings as a job has them, those of the plan by themselves; what is left out is as by default.
+    def report(self, job: Job) -> dict[str, Any] | None:
+        """What report.json holds so far; None before there is one.
 
-    Raises:
-        InvalidInput: if one means something that the method does not have.
-    """
-    given = {**defaults(method), **settings}
-    if method == "paper":
-        for key, (what, only) in _FIXED.items():
-            if given[key] != only:
-                raise InvalidInput(what, given[key], f"{only} with the method as published")
-    own = {key: value for key, value in given.items() if key not in _PLAN}
-    return {**own, "plan": {key: given[key] for key in _PLAN}}
+        Raises:
+            CorruptFile: if it is damaged.
+        """
+        path = self._folder(job) / REPORT_FILE
+        return read_json(path, _as_report) if path.is_file() else None
 
+    def trajectory(self, job: Job) -> Path:
+        """The file with an episode's course so far, see `app.episodes.trajectory`.
 
-def defaults(method: Method) -> dict[str, Any]:
-    """What settings are where nothing is said, as `flat` tells them."""
-    if method == "ours":
-        return flat(EpisodeSettings())
-    plan = GaussianPlanSettings()
-    own = {key: only for key, (_, only) in _FIXED.items()} | {key: getattr(plan, key) for key in _PLAN}
-    return {**flat(EpisodeSettings(STEPS)), **own}
+        Raises:
+            NoTrajectory: if there is none yet, or the episode was run by an earlier version.
+        """
+        path = self._folder(job) / TRAJECTORY_FILE
+        if not path.is_file():
+            raise NoTrajectory
+        return path
 
+    def frame(self, job: Job, step: int, part: Part) -> bytes:
+        """PNG of one frame, or of one of its pictures.
 
-def flat(settings: EpisodeSettings) -> dict[str, Any]:
-    """Settings as pages and programs have them: all in one place, without what nobody needs to change."""
-    own = ("steps", "replan_every", "cost", "planning", "acting", "despite_doubts")
-    return {name: getattr(settings, name) for name in own} | {name: getattr(settings.plan, name) for name in _PLAN}
+        Args:
+            job: the episode.
+            step: actions executed before the frame.
+            part: "all" for the whole frame, or which of the pictures in its upper row.
+
+        Raises:
+            UnknownName: if there is no such frame.
+            CorruptFile: if it is damaged.
+        """
+        path = self._folder(job) / FRAMES_FOLDER / f"{step:03d}.png"
+        try:
+            whole = path.read_bytes()
+        except FileNotFoundError:
+            count = len(list(path.parent.glob("[0-9]*.png")))
+            known = [f"0 to {count - 1}"] if count else ["none yet"]
+            raise UnknownName("frame", str(step), known) from None
+        return whole if part == "all" else encode_png(part_of(read_frame(path), part))
+
+    def thumbnail(self, job: Job, at: Literal["start", "end"]) -> bytes:
+        """Small PNG of the table, as the goal camera saw it first or last.
+
+        Raises:
+            UnknownName: if there is no frame yet.
+            CorruptFile: if it is damaged.
+        """
+        count = len(list((self._folder(job) / FRAMES_FOLDER).glob("[0-9]*.png")))
+        if not count:
+            raise UnknownName("picture", at, ["none yet"])
+        whole = read_frame(self._folder(job) / FRAMES_FOLDER / f"{count - 1 if at == 'end' else 0:03d}.png")
+        return encode_png(cv2.resize(part_of(whole, "now"), (THUMBNAIL_PX,) * 2, interpolation=cv2.INTER_AREA))
+
+    def files(self, job: Job) -> tuple[str, ...]:
+        """Names that can be downloaded now; those of an episode that was broken off are made when they are."""
+        folder = self._folder(job)
+        has_frames = job.is_finished and (folder / FRAMES_FOLDER / "000.png").is_file()
+        made = (VIDEO_FILE, RECORDING_FILE, ARCHIVE_FILE) if has_frames else ()
+        return tuple(name for name in FILES if (folder / name).is_file() or name in made)
+
+    def file(self, job: Job, name: str) -> Path:
+        """One of them.
+
+        Raises:
+            UnknownName: if there is none of this name.
+            CorruptFile: if what it would be made of is damaged.
+            CannotWrite: if it cannot be made.
+        """
+        names = self.files(job)
+        if name not in names:
+            raise UnknownName("file of this episode", name[:80], names)
+        with self._making:
+            return self._made(job, name)
+
+    def _made(self, job: Job, name: str) -> Path:
+        path = self._folder(job) / name
+        if not path.is_file() or (name == ARCHIVE_FILE and self._is_outdated(job, path)):
+            self._make(job, path)
+        return path
+
+    def _is_outdated(self, job: Job, archive: Path) -> bool:
+        """Whether something was made after the archive, such as a clip."""
+        made_at = archive.stat().st_mtime_ns
+        files = (self._folder(job) / name for name in self.files(job))
+        return any(file.is_file() and file.stat().st_mtime_ns > made_at for file in files)
+
+    def _make(self, job: Job, path: Path) -> None:
+        """What an episode has not left itself: all in one, or video and recording of one that was broken off."""
+        if path.name == ARCHIVE_FILE:
+            _pack(path, [self._made(job, name) for name in self.files(job) if name != ARCHIVE_FILE])
+            return
+        if path.name == VIDEO_FILE:
+            write_video(path, read_frames(path.parent / FRAMES_FOLDER))
+            return
+        from app.episodes.recording import write_recording
+
+        states = read_json(path.with_name(REPORT_FILE), _as_states)
+        write_recording(path, self._runner.library, states)
+
+    def _folder(self, job: Job) -> Path:
+        return self._runner.jobs.folder(job.id)
 
 
 def _of_all(poses: Poses, names: tuple[str, ...]) -> Poses:
@@ -313,3 +391,32 @@ def _of_all(poses: Poses, names: tuple[str, ...]) -> Poses:
     for name, pose in poses:
         unit_quaternion(pose.quaternion, f"quaternion of {name}")
     return poses
+
+
+def _pack(path: Path, files: list[Path]) -> None:
+    """Put files into a zip, which takes its name only when it is whole."""
+    with file_at_once(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in files:
+            archive.write(file, file.name)
+
+
+class _Step(Entry):
+    truth: StateJson
+
+
+class _Report(Entry):
+    steps: list[_Step]
+
+
+def _as_report(data: object) -> dict[str, Any]:
+    if not isinstance(data, dict) or not isinstance(data.get("steps"), list):
+        raise InvalidInput("report", shown(repr(data)), "a JSON object with a list of steps")
+    return data
+
+
+def _as_states(data: object) -> list[SceneState]:
+    """The true states of a report."""
+    steps = decode(_Report, data, "report").steps
+    if not steps:
+        raise InvalidInput("number of steps", 0, "1 at least")
+    return [step.truth.state() for step in steps]

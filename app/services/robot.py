@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from urllib.parse import urlsplit
 
 import cv2
@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from app.episodes.file_names import GOAL_FILE
+from app.episodes.settings import ChosenSettings
 from app.jobs.job import Job, JobChanged
 from app.jobs.kinds.robots import CameraPicture, read_picture
-from app.services.episodes import nested
 from app.services.event_hub import Notice
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
@@ -195,14 +195,14 @@ class AskedDrive:
         names: of the objects on its table.
         boxes: around the objects, by camera and name, if the robot delivers no masks [px].
         seed: of the searches.
-        settings: what differs from the defaults, as in other episodes.
+        settings: how it goes.
     """
 
     goal: str
     names: tuple[str, ...]
     boxes: Boxes = field(default_factory=dict)
     seed: int = 0
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: ChosenSettings = field(default_factory=ChosenSettings.defaults)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -296,7 +296,7 @@ class RobotTable:
             NoRobot: if there is none.
             ConnectionLost, RobotRefused: if it does not answer.
             UnknownName: if there is no such goal, or no camera of the robot took it.
-            MissingFields, InvalidInput: if an object cannot be recognised, or a setting is out of range.
+            MissingFields, InvalidInput: if an object cannot be recognised.
             RobotBusy: if it has one.
             QueueFull, StorageFull, CannotStore: if nothing more can be taken.
         """
@@ -309,7 +309,7 @@ class RobotTable:
         params = {
             "url": self._url, "title": goal.name, "names": list(asked.names), "goal_camera": goal.camera.name,
             "boxes": {camera: dict(boxes) for camera, boxes in asked.boxes.items()}, "seed": asked.seed,
-            "settings": nested(asked.settings), "box": self._limits.box, "top_speed_m_s": self._limits.top_speed_m_s,
+            "settings": asked.settings.to_job(), "box": self._limits.box, "top_speed_m_s": self._limits.top_speed_m_s,
         }  # fmt: skip
         with self._ordering, self._runner.jobs.new_inputs() as folder:
             if self._live() is not None:

@@ -19,12 +19,12 @@ from schemathesis.specs.openapi.checks import (
 from app.api.app_factory import create_app
 from app.episodes.file_names import FRAMES_FOLDER, REPORT_FILE
 from app.episodes.frames import HEIGHT, WIDTH
-from app.services.episode_results import FILES
+from app.services.episodes import FILES
 from app.services.service_settings import Settings
 from osfcore.io.files import write_json
 from osfcore.io.image_file import write_png
 from tests.app.conftest import keep_busy, leave_running, running
-from tests.app.services.goals.test_goals import photo
+from tests.app.services.test_goals import photo
 
 CHECKS = (
     not_a_server_error,

@@ -95,13 +95,15 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     from app.episodes.progress import TimeLeft
     from app.episodes.record import About, EpisodeRecord
     from app.episodes.recording import write_recording
+    from app.episodes.settings import ChosenSettings
     from app.jobs.kinds.remote_world import RemoteWorld
     from osfcore.control.closed_loop import Episode
     from osfcore.control.goal import GoalImage
 
     assert place.orders is not None, "the job's process sets it"
     use_one_thread()
-    settings, names, method = settings_of(params["settings"]), tuple(params["names"]), method_of(params)
+    chosen, names = ChosenSettings.of_job(params), tuple(params["names"])
+    settings, method = chosen.of_loop(), chosen.method
     yield EpisodeProgress(0, 0, "Loading fields, half a minute the first time")
     models = _models(method, names, place)
     world = RemoteWorld(place.orders.ask, params["scene"])
@@ -122,7 +124,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     with contextlib.closing(record):
         for event in loop.run():
             for change in place.orders.changes():
-                loop.settings = settings_of(change["settings"])
+                loop.settings = ChosenSettings.of_job(change).of_loop()
             record.take(event)
             share, left_s = timer.take(event, progress.total or settings.steps)
             then = _progress_after(progress, pictures.drawn(event))
@@ -137,11 +139,6 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     write_recording(place.folder / RECORDING_FILE, place.library, record.states)
     world.close()
     yield replace(progress, note=progress.text or progress.note, view=None)
-
-
-def method_of(params: Mapping[str, Any]) -> Method:
-    """Whose method an episode is, by its parameters; earlier versions had but one."""
-    return params.get("method", "ours")
 
 
 def _models(method: Method, names: tuple[str, ...], place: JobContext) -> SceneModels:
@@ -216,19 +213,6 @@ def _progress_after(before: EpisodeProgress, event: Event) -> EpisodeProgress:
             return replace(then, view=event)
 
 
-def settings_of(given: Mapping[str, Any]) -> EpisodeSettings:
-    """Settings from JSON; what is left out is as by default.
-
-    Raises:
-        InvalidInput: if a number is out of range.
-    """
-    from osfcore.control.events import EpisodeSettings
-    from osfcore.planning.mppi import PlanSettings
-
-    own = {key: value for key, value in given.items() if key != "plan"}
-    return EpisodeSettings(**own, plan=PlanSettings(**given.get("plan", {})))
-
-
 def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> GoalImage | PoseGoal:
     """The goal image among the inputs, or the poses in the parameters, with a photograph of them if there is one."""
     from app.episodes.request import read_goal
@@ -272,13 +256,20 @@ class _Goal(Entry):
     id: Text | None
 
 
+def _known_settings(given: dict[str, Any]) -> dict[str, Any]:
+    from app.episodes.settings import ChosenSettings
+
+    ChosenSettings.of_job({"settings": given})
+    return given
+
+
 class EpisodeParams(Entry):
     """What a stored episode must name."""
 
     scene: Text
     names: list[Text]
     seed: int
-    settings: Annotated[dict[str, Any], AfterValidator(settings_of)]
+    settings: Annotated[dict[str, Any], AfterValidator(_known_settings)]
     goal: _Goal
 
 

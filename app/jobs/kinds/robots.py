@@ -18,7 +18,7 @@ from urllib.parse import quote
 from app.episodes.file_names import CAMERAS_FOLDER, GOAL_FILE, REPORT_FILE, STOPPED
 from app.jobs.job import INPUTS, Job
 from app.jobs.kind import JobKind
-from app.jobs.kinds.episodes import settings_of, use_one_thread
+from app.jobs.kinds.episodes import use_one_thread
 from osfcore.contrib.robots.robot import ConnectionLost, SafetyLimits
 from osfcore.errors import OsfError
 from osfcore.estimation.camera_response import srgb_of_linear
@@ -131,12 +131,13 @@ def _after(progress: RobotProgress, event: Event) -> RobotProgress:
 
 def _order(params: dict[str, Any], place: JobContext) -> DriveOrder:
     from app.episodes.robot import DriveOrder
+    from app.episodes.settings import ChosenSettings
 
     goal: Path = place.folder / INPUTS / GOAL_FILE
     limits = SafetyLimits((*params["box"],), params["top_speed_m_s"])  # pyright: ignore[reportArgumentType]
     return DriveOrder(
         params["url"], tuple(params["names"]), goal, place.folder, place.data_dir, params["goal_camera"],
-        boxes=params["boxes"], limits=limits, seed=params["seed"], settings=settings_of(params["settings"]),
+        boxes=params["boxes"], limits=limits, seed=params["seed"], settings=ChosenSettings.of_job(params).of_loop(),
     )  # fmt: skip
 
 

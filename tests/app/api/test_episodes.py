@@ -9,9 +9,8 @@ from pydantic import ValidationError
 from app.api.episodes import EpisodeIn, EpisodeOut, ServiceSettings, SettingsIn
 from app.episodes.file_names import FRAMES_FOLDER, REPORT_FILE
 from app.episodes.frames import HEIGHT, WIDTH
+from app.episodes.settings import ChosenSettings
 from app.jobs.job import Job
-from app.jobs.kinds.episodes import settings_of
-from app.services.episodes import nested
 from osfcore.control.events import EpisodeSettings
 from osfcore.io.image_file import write_png
 from osfcore.io.scene_file import Scene, scene_to_json
@@ -166,7 +165,7 @@ def test_orders_reach_the_job(service, services, waiting, monkeypatch):
     assert service.patch(f"{address}/settings", json={"samples": 8}).status_code == 200
     assert [order for order, *_ in given] == ["pause", "resume", "step", "change"]
     settings = given[-1][2]["settings"]
-    assert (settings["steps"], settings["plan"]["samples"]) == (5, 8)  # what is left out stays
+    assert (settings["steps"], settings["samples"]) == (5, 8)  # what is left out stays
 
 
 @pytest.mark.slow
@@ -251,7 +250,7 @@ def test_an_object_without_a_field_as_published_is_a_conflict_in_words(service, 
     )
 
 
-PARAMS = {"scene": "s", "names": ["box"], "seed": 3, "settings": nested({"steps": 5}), "goal": {"id": "g"}}
+PARAMS = {"scene": "s", "names": ["box"], "seed": 3, "settings": {"steps": 5}, "goal": {"id": "g"}}
 STEP = {
     "step": 0,
     "seconds": {"first": 9.5},
@@ -267,7 +266,7 @@ REPORT = {"steps": [STEP], "noticed": [{"step": 0, "matter": "goal", "text": "It
 
 
 def told(job, report=None, files=()):
-    return EpisodeOut.of_job(job, "A box", settings_of(job.params["settings"]), report, files)
+    return EpisodeOut.of_job(job, "A box", ChosenSettings.of_job(job.params), report, files)
 
 
 def test_only_what_was_said_is_handed_on():
@@ -276,8 +275,9 @@ def test_only_what_was_said_is_handed_on():
         "steps": 5,
         "acting": False,
     }
-    asked = EpisodeIn.model_validate({"goal": "g", "settings": {"samples": 8}}).asked()
-    assert (asked.scene, asked.goal, asked.poses, asked.seed, asked.settings) == (None, "g", None, 0, {"samples": 8})
+    asked = EpisodeIn.model_validate({"goal": "g", "settings": {"samples": 8}})
+    assert (asked.scene, asked.goal, asked.poses, asked.seed) == (None, "g", None, 0)
+    assert asked.chosen() == ChosenSettings.defaults().changed({"samples": 8})
 
 
 @pytest.mark.parametrize(
@@ -330,8 +330,7 @@ def test_one_that_is_over_tells_how_it_ended(state):
 def test_the_defaults_are_those_of_an_episode_without_settings():
     defaults = ServiceSettings.now().episode.defaults
     assert defaults.method == "ours"
-    assert nested(defaults.model_dump(exclude={"method"})) == nested({})
-    assert defaults.model_dump()["steps"] == EpisodeSettings().steps
+    assert defaults.of_loop() == EpisodeSettings()
 
 
 def test_what_counts_as_reached_is_what_an_episode_goes_by():
@@ -344,19 +343,18 @@ def test_the_method_as_published_has_defaults_of_its_own():
     assert (published.method, published.cost, published.replan_every) == ("paper", "image", 1)
     own = GaussianPlanSettings()
     assert (published.samples, published.horizon, published.temperature) == (own.samples, own.horizon, own.temperature)
-    assert nested(published.model_dump(exclude={"method"}), "paper") == nested({}, "paper")
 
 
 def test_the_method_is_asked_for_among_the_settings():
-    asked = EpisodeIn.model_validate({"scene": "s", "goal": "g", "settings": {"method": "paper", "steps": 4}}).asked()
-    assert (asked.method, asked.settings) == ("paper", {"steps": 4})
-    assert EpisodeIn.model_validate({"scene": "s", "goal": "g"}).asked().method == "ours"
+    asked = EpisodeIn.model_validate({"scene": "s", "goal": "g", "settings": {"method": "paper", "steps": 4}}).chosen()
+    assert (asked.method, asked.steps) == ("paper", 4)
+    assert EpisodeIn.model_validate({"scene": "s", "goal": "g"}).chosen().method == "ours"
 
 
 def test_steps_of_a_method_that_looks_at_images_alone_know_no_distances():
     step = {"step": 0, "seconds": {}, "image_cost": 0.1, "to_goal_mm": None, "to_goal_deg": None, "estimate_off_mm": {}}
     job = Job("a", "episode", {**PARAMS, "method": "paper"})
-    out = EpisodeOut.of_job(job, "A", EpisodeSettings(), {"steps": [step]}, ())
+    out = EpisodeOut.of_job(job, "A", ChosenSettings.of_job(job.params), {"steps": [step]}, ())
     assert out.settings.method == "paper"
     assert (out.steps[0].to_goal_mm, out.steps[0].to_goal_deg) == (None, None)
 

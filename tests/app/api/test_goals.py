@@ -18,7 +18,7 @@ from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.scene_file import camera_to_json
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import LONG, until
-from tests.app.services.goals.test_goals import photo
+from tests.app.services.test_goals import photo
 from tests.app.storage.test_photos import ODD_ANY, ODD_TURNED, ODD_UPRIGHT, jpeg_with
 
 BOX, MUSTARD = "003_cracker_box", "006_mustard_bottle"

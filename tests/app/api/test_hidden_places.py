@@ -10,7 +10,7 @@ from osfcore.errors import CannotWrite, CorruptFile
 from tests.app.api.test_events import Stream
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import keep_busy, running, until
-from tests.app.services.goals.test_goals import photo
+from tests.app.services.test_goals import photo
 
 BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
 PNG = {"Content-Type": "image/png"}

@@ -6,6 +6,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from app.api.episodes import SettingsIn
 from app.api.status import Metrics, MetricsMiddleware
+from app.episodes.settings import ChosenSettings
 from app.jobs.job import Job, ended, job_fields
 from app.storage.database import Store
 from app.storage.field_files import open_workshop
@@ -14,7 +15,7 @@ from osfcore.errors import InvalidInput
 from tests.app.api.test_jobs import TABLE
 from tests.app.api.test_problems import is_problem
 from tests.app.conftest import full_disk, keep_busy, running, until
-from tests.app.services.goals.test_goals import photo
+from tests.app.services.test_goals import photo
 
 
 def test_health_tells_version_objects_and_stage(service, library):
@@ -52,16 +53,14 @@ def test_what_is_at_a_bound_is_taken_and_what_is_beyond_is_refused_before_anythi
 
 
 def test_the_bounds_are_those_of_the_settings_themselves(service):
-    from app.jobs.kinds.episodes import settings_of
-    from app.services.episodes import nested
-
+    ours = ChosenSettings.defaults()
     for name, bounds in service.get("/api/settings").json()["episode"]["bounds"].items():
         whole = int if name != "temperature" else float
         for bound in bounds:
-            settings_of(nested({name: whole(bound)}))
+            ours.changed({name: whole(bound)})
         for beyond in (whole(bounds[1] * 2), whole(bounds[0] / 2)):
             with pytest.raises(InvalidInput):
-                settings_of(nested({name: beyond}))
+                ours.changed({name: beyond})
 
 
 def test_health_tells_of_what_could_not_be_stored_until_it_is(service, scene):

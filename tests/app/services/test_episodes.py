@@ -24,15 +24,14 @@ from app.episodes.file_names import (
     VIDEO_FILE,
 )
 from app.episodes.frames import HEIGHT, TILE_PX, WIDTH, frame, part_of
+from app.episodes.settings import ChosenSettings
 from app.jobs.job import FINISHED
 from app.processes.messages.scene_messages import ComposedGoal
-from app.services.episode_results import FILES, NoTrajectory
-from app.services.episodes import AskedEpisode, EpisodeGoesOn, Episodes, GoalUnknown, NoGoal, flat, nested
+from app.services.episodes import FILES, EpisodeGoesOn, Episodes, GoalUnknown, NoGoal, NoTrajectory
 from app.services.fields import FieldCatalogue, MissingFields, NoPublishedField
 from app.services.goals import GoalRefused, NoTable
 from app.storage.database import CannotStore
 from app.storage.records import GoalRecord, GoalStore, poses_to_json
-from osfcore.control.events import EpisodeSettings
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
@@ -113,12 +112,16 @@ def left_over(tmp_path):
     return list((tmp_path / "collections").glob(".new-*"))
 
 
+def chosen(changes=None, method="ours"):
+    return ChosenSettings.defaults(method).changed(changes or {})
+
+
 # Asking for one
 
 
 @pytest.mark.slow
 def test_an_episode_toward_a_goal_image_takes_its_own_copy_along(episodes, runner, goals, tmp_path):
-    job = episodes.start(AskedEpisode(goal="made", seed=5, settings={"samples": 8}))
+    job = episodes.start(chosen({"samples": 8}), goal="made", seed=5)
     assert (job.kind, job.params["scene"], job.params["names"], job.params["seed"]) == (
         "episode",
         "s",
@@ -128,7 +131,7 @@ def test_an_episode_toward_a_goal_image_takes_its_own_copy_along(episodes, runne
     goal = job.params["goal"]
     assert (goal["id"], goal["poses"], goal["camera"]["width"]) == ("made", None, 64)
     assert goal["truth"] == poses_to_json(POSES)
-    assert job.params["settings"]["plan"]["samples"] == 8
+    assert job.params["settings"]["samples"] == 8
     goals.remove("made")
     assert (runner.jobs.inputs(job.id) / GOAL_FILE).read_bytes() == PNG
     assert json.loads(json.dumps(job.params)) == job.params
@@ -137,7 +140,7 @@ def test_an_episode_toward_a_goal_image_takes_its_own_copy_along(episodes, runne
 
 @pytest.mark.slow
 def test_an_episode_toward_poses_knows_where_everything_truly_should_be(episodes, tmp_path):
-    goal = episodes.start(AskedEpisode(scene="s", poses=POSES)).params["goal"]
+    goal = episodes.start(chosen(), scene="s", poses=POSES).params["goal"]
     assert goal == {"id": None, "camera": None, "poses": poses_to_json(POSES), "truth": poses_to_json(POSES)}
     assert left_over(tmp_path) == []
 
@@ -145,15 +148,15 @@ def test_an_episode_toward_poses_knows_where_everything_truly_should_be(episodes
 def test_a_goal_that_shows_something_else_is_refused_unless_doubts_do_not_matter(episodes, goals, checks, tmp_path):
     checks.refused = "photo"
     with pytest.raises(GoalRefused):
-        episodes.start(AskedEpisode(goal="photo"))
+        episodes.start(chosen(), goal="photo")
     assert goals.has_draft
     assert left_over(tmp_path) == []
-    assert episodes.start(AskedEpisode(goal="photo", settings={"despite_doubts": True})).kind == "episode"
-    assert episodes.start(AskedEpisode(goal="made")).kind == "episode"
+    assert episodes.start(chosen({"despite_doubts": True}), goal="photo").kind == "episode"
+    assert episodes.start(chosen(), goal="made").kind == "episode"
 
 
 def test_one_clip_at_a_time_is_made_of_an_episode_that_is_over(episodes, runner):
-    job = episodes.start(AskedEpisode(goal="made"))
+    job = episodes.start(chosen(), goal="made")
     with pytest.raises(EpisodeGoesOn):
         episodes.make_clip(job)
     job = runner.jobs.put(job.id, state="done")
@@ -172,38 +175,36 @@ def test_one_clip_at_a_time_is_made_of_an_episode_that_is_over(episodes, runner)
 
 def test_composing_ends_when_an_episode_takes_the_scene_but_not_when_it_is_refused(episodes, goals):
     with pytest.raises(NoGoal):
-        episodes.start(AskedEpisode())
+        episodes.start(chosen())
     assert goals.has_draft
-    episodes.start(AskedEpisode(poses=POSES))
+    episodes.start(chosen(), poses=POSES)
     assert not goals.has_draft
 
 
 @pytest.mark.parametrize("other", [{"scene": "t"}, {"poses": POSES[:1]}, {"poses": None}, {"scene": None}])
 def test_of_an_image_of_something_else_the_truth_is_unknown(episodes, goals, other):
     goals.keep(replace(goals.get("made"), id="other", **other), PNG)
-    assert episodes.start(AskedEpisode(goal="other")).params["goal"]["truth"] is None
-    assert episodes.start(AskedEpisode(goal="photo")).params["goal"]["truth"] is None
+    assert episodes.start(chosen(), goal="other").params["goal"]["truth"] is None
+    assert episodes.start(chosen(), goal="photo").params["goal"]["truth"] is None
 
 
 @pytest.mark.parametrize(
     ("asked", "kind", "words"),
     [
-        (AskedEpisode(), NoGoal, "needs a goal"),
-        (AskedEpisode(goal="made", poses=POSES), NoGoal, "needs a goal"),
-        (AskedEpisode(goal="none"), UnknownName, "no such goal"),
-        (AskedEpisode(scene="t", goal="made"), UnknownName, "no scene named 't'"),
-        (AskedEpisode(goal="made", seed=-1), InvalidInput, "seed"),
-        (AskedEpisode(goal="made", settings={"steps": 0}), InvalidInput, "number of steps"),
-        (AskedEpisode(goal="made", settings={"horizon": 1000}), InvalidInput, "horizon"),
-        (AskedEpisode(poses=POSES[:1]), InvalidInput, f"{BOX}, {MUSTARD}, each once"),
-        (AskedEpisode(poses=(*POSES, POSES[0])), InvalidInput, "each once"),
-        (AskedEpisode(poses=()), InvalidInput, "none"),
-        (AskedEpisode(poses=(POSES[0], (MUSTARD, Pose(np.zeros(3), np.zeros(4))))), InvalidInput, "unit quaternion"),
+        ({}, NoGoal, "needs a goal"),
+        ({"goal": "made", "poses": POSES}, NoGoal, "needs a goal"),
+        ({"goal": "none"}, UnknownName, "no such goal"),
+        ({"scene": "t", "goal": "made"}, UnknownName, "no scene named 't'"),
+        ({"goal": "made", "seed": -1}, InvalidInput, "seed"),
+        ({"poses": POSES[:1]}, InvalidInput, f"{BOX}, {MUSTARD}, each once"),
+        ({"poses": (*POSES, POSES[0])}, InvalidInput, "each once"),
+        ({"poses": ()}, InvalidInput, "none"),
+        ({"poses": (POSES[0], (MUSTARD, Pose(np.zeros(3), np.zeros(4))))}, InvalidInput, "unit quaternion"),
     ],
 )
 def test_what_cannot_be_is_refused_and_leaves_nothing(episodes, runner, tmp_path, asked, kind, words):
     with pytest.raises(kind, match=words):
-        episodes.start(asked)
+        episodes.start(chosen(), **asked)
     assert runner.jobs.all() == ()
     assert left_over(tmp_path) == []
 
@@ -211,10 +212,10 @@ def test_what_cannot_be_is_refused_and_leaves_nothing(episodes, runner, tmp_path
 def test_without_a_scene_or_without_fields_there_is_nothing_to_do(episodes, runner):
     runner.scenes.names = (BOX, "spoon")
     with pytest.raises(MissingFields):
-        episodes.start(AskedEpisode(goal="made"))
+        episodes.start(chosen(), goal="made")
     runner.scenes.current = None
     with pytest.raises(NoTable):
-        episodes.start(AskedEpisode(goal="made"))
+        episodes.start(chosen(), goal="made")
 
 
 def test_a_full_disk_is_told_and_leaves_nothing(episodes, tmp_path, monkeypatch):
@@ -224,37 +225,22 @@ def test_a_full_disk_is_told_and_leaves_nothing(episodes, tmp_path, monkeypatch)
 
     monkeypatch.setattr("app.services.episodes.shutil.copyfile", full)
     with pytest.raises(CannotStore):
-        episodes.start(AskedEpisode(goal="made"))
+        episodes.start(chosen(), goal="made")
     assert left_over(tmp_path) == []
 
 
-def test_settings_come_back_as_they_were_given():
-    given = {"steps": 7, "samples": 8, "horizon": 4, "temperature": 0.5, "cost": "image", "acting": False}
-    assert nested({})["plan"]["samples"] == EpisodeSettings().plan.samples
-    assert {**flat(EpisodeSettings()), **given} == flat(Episodes.settings(AskedJob(nested(given))))
-    assert set(nested({})) >= {"steps", "plan"}
-    assert not set(nested(given)) & {"samples", "horizon", "temperature"}
-
-
-class AskedJob:
-    """As much of a job as its settings."""
-
-    def __init__(self, settings):
-        self.params = {"settings": settings}
-
-
 def test_settings_may_change_and_what_is_left_out_stays(episodes, runner):
-    job = episodes.start(AskedEpisode(goal="made", settings={"samples": 8, "steps": 9}))
+    job = episodes.start(chosen({"samples": 8, "steps": 9}), goal="made")
     job = episodes.change(job, {"horizon": 4})
     now = episodes.settings(job)
-    assert (now.steps, now.plan.samples, now.plan.horizon) == (9, 8, 4)
+    assert (now.steps, now.samples, now.horizon) == (9, 8, 4)
     with pytest.raises(InvalidInput, check=about("horizon")):
         episodes.change(job, {"horizon": 0})
     assert episodes.settings(runner.jobs.get(job.id)) == now
 
 
 def test_only_episodes_are_told_of(episodes, runner, tmp_path):
-    first, second = (episodes.start(AskedEpisode(poses=POSES)) for _ in range(2))
+    first, second = (episodes.start(chosen(), poses=POSES) for _ in range(2))
     (tmp_path / "inputs").mkdir()
     other = runner.jobs.submit("estimate", {}, tmp_path / "inputs")
     assert [job.id for job in episodes.page(10).jobs] == [second.id, first.id]
@@ -275,7 +261,7 @@ def drawn(number):
 @pytest.fixture
 def broken_off(episodes, runner):
     """An episode that stopped after two steps."""
-    job = episodes.start(AskedEpisode(poses=POSES))
+    job = episodes.start(chosen(), poses=POSES)
     folder = runner.jobs.folder(job.id)
     for number in range(2):
         write_png(folder / FRAMES_FOLDER / f"{number:03d}.png", drawn(number))
@@ -356,7 +342,7 @@ def test_frames_that_are_damaged_or_not_there_yet_are_told(episodes, runner, bro
         episodes.frame(broken_off, 1, "goal")
     with pytest.raises(CorruptFile, check=about("001.png")):
         episodes.file(broken_off, VIDEO_FILE)
-    fresh = episodes.start(AskedEpisode(poses=POSES))
+    fresh = episodes.start(chosen(), poses=POSES)
     with pytest.raises(UnknownName, check=about("frame")):
         episodes.frame(fresh, 0, "all")
     assert episodes.files(fresh) == ()
@@ -479,7 +465,7 @@ def test_its_thumbnails_are_small_and_of_its_ends(service, done):
 
 
 def test_names_that_are_taken_get_a_number(episodes):
-    names = [episodes.name(episodes.start(AskedEpisode(goal="made"))) for _ in range(3)]
+    names = [episodes.name(episodes.start(chosen(), goal="made")) for _ in range(3)]
     assert names == ["Made", "Made 2", "Made 3"]
 
 
@@ -505,28 +491,14 @@ def test_the_events_of_one_that_is_over_end_at_once(service, done):
 @pytest.fixture
 def published(episodes):
     """An episode of it that waits."""
-    return episodes.start(AskedEpisode(goal="made", method="paper", settings={"steps": 4}))
-
-
-def test_the_method_as_published_begins_with_its_own_settings(published):
-    assert published.params["method"] == "paper"
-    settings = published.params["settings"]
-    assert (settings["steps"], settings["cost"], settings["replan_every"]) == (4, "image", 1)
-    assert settings["plan"] == {"samples": 200, "horizon": 15, "temperature": 0.3}
-
-
-@pytest.mark.parametrize("setting", [{"cost": "pose"}, {"replan_every": 2}, {"planning": False}, {"acting": False}])
-def test_what_the_method_as_published_does_not_have_is_refused(episodes, setting, tmp_path):
-    with pytest.raises(InvalidInput):
-        episodes.start(AskedEpisode(goal="made", method="paper", settings=setting))
-    assert left_over(tmp_path) == []
+    return episodes.start(chosen({"steps": 4}, method="paper"), goal="made")
 
 
 def test_objects_without_a_field_as_published_are_refused_before_the_start(episodes, monkeypatch, tmp_path):
     monkeypatch.setattr(FieldCatalogue, "published", lambda _: (BOX,))
     with pytest.raises(NoPublishedField):
-        episodes.start(AskedEpisode(goal="made", method="paper"))
-    assert episodes.start(AskedEpisode(goal="made")).params["method"] == "ours"
+        episodes.start(chosen(method="paper"), goal="made")
+    assert episodes.start(chosen(), goal="made").params["settings"]["method"] == "ours"
     assert left_over(tmp_path) == []
 
 
@@ -538,7 +510,7 @@ def test_poses_become_the_image_that_the_method_as_published_wants(episodes, run
         return ComposedGoal(PNG, POSES)
 
     monkeypatch.setattr(runner.scenes, "compose", compose, raising=False)
-    job = episodes.start(AskedEpisode(scene="s", poses=POSES, method="paper"))
+    job = episodes.start(chosen(method="paper"), scene="s", poses=POSES)
     assert [(command.id, command.poses) for command in asked] == [("s", POSES)]
     goal = job.params["goal"]
     assert (goal["id"], goal["poses"], goal["truth"]) == (None, None, poses_to_json(POSES))
@@ -549,7 +521,7 @@ def test_poses_become_the_image_that_the_method_as_published_wants(episodes, run
 def test_an_episode_keeps_its_method_and_the_one_as_published_all_else(episodes, published):
     with pytest.raises(InvalidInput):
         episodes.change(published, {"steps": 5})
-    ours = episodes.start(AskedEpisode(goal="made"))
+    ours = episodes.start(chosen(), goal="made")
     with pytest.raises(InvalidInput, check=about("method")):
         episodes.change(ours, {"method": "paper"})
     assert episodes.change(ours, {"method": "ours", "steps": 5}).params["settings"]["steps"] == 5

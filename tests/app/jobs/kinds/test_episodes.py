@@ -18,12 +18,11 @@ from app.episodes.file_names import (
 from app.jobs.context import JobContext, JobControl, RunJob
 from app.jobs.job import INPUTS
 from app.jobs.kinds import KINDS
-from app.jobs.kinds.episodes import EpisodeProgress, episode_job, settings_of
+from app.jobs.kinds.episodes import EpisodeProgress, episode_job
 from app.jobs.worker import run_job
 from app.processes.plan_summary import PlanSketch
 from osfcore.control import estimators
-from osfcore.control.events import ActionExecuted, EpisodeSettings, Looking, Observed, Planning, Stepped
-from osfcore.errors import InvalidInput
+from osfcore.control.events import ActionExecuted, Looking, Observed, Planning, Stepped
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
@@ -34,10 +33,9 @@ from osfcore.paper import stages
 from osfcore.paper.estimation import PaperEstimationConfig, estimate_first
 from osfcore.progress import Progress
 from tests.app.jobs.kinds.test_remote_world import NAMES, Stage, stage  # noqa: F401  a fixture
-from tests.support.errors import about
 from tests.support.tabletop_scenes import perfect_fit, sure
 
-SMALL = {"steps": 3, "plan": {"samples": 16, "horizon": 6}}
+SMALL = {"steps": 3, "samples": 16, "horizon": 6}
 
 
 class Told:
@@ -224,13 +222,6 @@ def test_whoever_stops_it_leaves_its_steps_and_nothing_half_written(place, stage
     }
     assert len(report_of(place)["steps"]) == 2
     assert step.seconds == report_of(place)["seconds"] > 0
-
-
-def test_settings_in_json_are_checked_like_any(stage):  # noqa: F811
-    assert settings_of({}).steps == EpisodeSettings().steps
-    assert settings_of(SMALL).plan.samples == 16
-    with pytest.raises(InvalidInput, check=about("horizon")):
-        settings_of({"plan": {"horizon": 0}})
 
 
 def test_rounds_end_where_a_step_of_the_loop_does():
