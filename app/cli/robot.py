@@ -114,7 +114,7 @@ class RobotDriveCommand(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Drive; the result is report.json without the single steps."""
-        from app.episodes.progress import note_of
+        from app.episodes.progress import EpisodeProgress
         from app.episodes.robot import RobotDrive
 
         order = self._order()
@@ -127,9 +127,10 @@ class RobotDriveCommand(DataCommand):
                 return allowed
 
             drive = opened.enter_context(contextlib.closing(RobotDrive(order, permit)))
-            said = ""
+            progress, said = EpisodeProgress(0, self.steps, ""), ""
             for event in drive.run():
-                note = (note_of(event) or said).partition(": ")[0]  # what follows counts up
+                progress = progress.after(event)
+                note = progress.note.partition(": ")[0]  # what follows counts up
                 if note != said:
                     self.say(note)
                 said = note

@@ -17,8 +17,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from app.episodes.file_names import GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
-from app.episodes.trajectory import LookFrame, Moment, ReplayClock, Trajectory, read_trajectory
-from app.processes.plan_summary import PlanSketch
+from app.episodes.trajectory import LookFrame, Moment, PlanSketch, ReplayClock, Trajectory, read_trajectory
 from osfcore.errors import CannotWrite, OsfError
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Looking, Noticed, Planning, Stepped
 
@@ -16,7 +17,41 @@ _FOUND = {
 }
 
 
-def note_of(event: Event) -> str | None:
+@dataclass(frozen=True, eq=False, slots=True)
+class EpisodeProgress:
+    """How far an episode is.
+
+    Attributes:
+        done: actions executed.
+        total: actions at most; 0 while that is not known.
+        note: what is being done, for a person.
+        stage: which part of the loop is at work: "first", "goal", "plan", "act", "next" or "search"; None before it.
+        outcome: how it ended; only at the end.
+        text: the same in a sentence.
+    """
+
+    done: int
+    total: int
+    note: str
+    stage: str | None = None
+    outcome: str | None = None
+    text: str | None = None
+
+    def after(self, event: Event) -> Self:
+        """Return how far the episode is once something has happened."""
+        then = replace(self, note=_note_of(event) or self.note, stage=_stage_of(event) or self.stage)
+        match event:
+            case ActionExecuted(number):
+                return replace(then, done=number)
+            case Stepped():
+                return replace(then, total=event.steps)
+            case Finished(_, outcome, text):
+                return replace(then, outcome=outcome, text=text, note=text)
+            case _:
+                return then
+
+
+def _note_of(event: Event) -> str | None:
     """What is being done, for a person; None if this event changes nothing about it."""
     match event:
         case Looking():
@@ -36,7 +71,7 @@ def note_of(event: Event) -> str | None:
             return None
 
 
-def stage_of(event: Event) -> str | None:
+def _stage_of(event: Event) -> str | None:
     """Which part of the loop an event belongs to; None if it says nothing about that."""
     match event:
         case Looking():

@@ -6,8 +6,8 @@ import contextlib
 import csv
 import io
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,7 +30,7 @@ from osfcore.control.events import (
 from osfcore.control.goal import GoalImage
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.states import SceneState
+from osfcore.geometry.states import Observation, SceneState
 from osfcore.io.files import as_mapping, read_json, write_atomically, write_json
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.json_codec import encode
@@ -81,6 +81,7 @@ class About:
     """What a record says besides what happens.
 
     Attributes:
+        names: of the objects.
         seed: of the searches, and of the scene where the episode made it.
         settings: at the beginning.
         goal: how the table truly should be; None where nobody knows.
@@ -89,16 +90,19 @@ class About:
         method: whose.
         image: the goal, where a method looks at the image alone: it finds no poses in it.
         parts: of the episode, where they were chosen by name.
+        robot: what the report says of a robot; of a simulation nothing.
     """
 
+    names: tuple[str, ...]
     seed: int
     settings: EpisodeSettings
-    goal: SceneState | None
-    moved: tuple[str, ...]
-    symmetries: Mapping[str, Symmetry]
+    goal: SceneState | None = None
+    moved: tuple[str, ...] = ()
+    symmetries: Mapping[str, Symmetry] = field(default_factory=dict)
     method: Method = "ours"
     image: GoalImage | None = None
     parts: PartNames | None = None
+    robot: Callable[[], Mapping[str, Any]] = dict
 
 
 class EpisodeRecord:
@@ -106,11 +110,12 @@ class EpisodeRecord:
 
     Report, course and table are written whole, each time a twentieth of the steps has come since the last time: after
     every step of the first twenty, and later so seldom that writing takes time in proportion to the number of steps.
-    Whoever breaks an episode off calls `close`, which writes the rest; one that is killed loses that twentieth.
+    Whoever breaks an episode off calls `close` or `break_off`, which write the rest; one that is killed loses that
+    twentieth. Without a simulation, which knows the truth, there is no course, and frames show a camera's image.
 
     Args:
         folder: for them.
-        table: that the episode is about.
+        table: the simulated table; None where nobody knows the truth.
         about: what it was asked to be.
         clock: tells the time [s].
 
@@ -120,10 +125,10 @@ class EpisodeRecord:
     """
 
     def __init__(
-        self, folder: Path, table: Table, about: About, clock: Callable[[], float] = time.perf_counter
+        self, folder: Path, table: Table | None, about: About, clock: Callable[[], float] = time.perf_counter
     ) -> None:
         self._folder, self._table, self._about = folder, table, about
-        self._views: Float[np.ndarray, "V h w 3"] | None = None
+        self._seen: Observation | None = None
         self._goal: GoalFound | None = None
         self._image, self._photo = about.image, None
         self._steps: list[dict[str, Any]] = []
@@ -132,9 +137,9 @@ class EpisodeRecord:
         self.steps_written = 0
         self._clock, self._since = clock, clock()
         self._actions: list[list[float]] = []
-        self._end: Finished | None = None
-        self._start = table.truth()
-        self._course = TrajectoryRecorder(self._start)
+        self._end: tuple[str, str] | None = None
+        self._start = None if table is None else table.truth()
+        self._course = None if self._start is None else TrajectoryRecorder(self._start)
         for left in (folder / FRAMES_FOLDER).glob("[0-9]*.png"):  # of an earlier, perhaps longer episode
             left.unlink()
         if about.image is not None:
@@ -143,7 +148,7 @@ class EpisodeRecord:
     @property
     def states(self) -> list[SceneState]:
         """True ones, at the beginning and after each action."""
-        return self._course.states
+        return [] if self._course is None else self._course.states
 
     def take(self, event: Event) -> None:
         """Note an event, and draw a frame where a step is over.
@@ -153,10 +158,11 @@ class EpisodeRecord:
         """
         now = self._clock()
         self._seconds, self._since = self._seconds + now - self._since, now
-        self._course.take(event, self._table)
+        if self._course is not None and self._table is not None:
+            self._course.take(event, self._table)
         match event:
             case Observed():
-                self._views = event.observation.images
+                self._seen = event.observation
             case GoalFound():
                 self._goal = event
                 self._photo = event.photo
@@ -169,7 +175,7 @@ class EpisodeRecord:
                 self._steps.append(self._step_entry(event))
                 self._draw(event)
             case Finished():
-                self._end = event
+                self._end = event.outcome, event.text
             case _:
                 pass
         unwritten = len(self._steps) - self.steps_written
@@ -181,13 +187,23 @@ class EpisodeRecord:
         """Leave out the time since the last event: the episode rested."""
         self._since = self._clock()
 
-    def finish(self) -> dict[str, Any]:
-        """Write the video, and tell the report.
+    def break_off(self, outcome: str, reason: str) -> None:
+        """Note that the episode ended before its end, unless that has come.
 
         Raises:
             CannotWrite: if the disk refuses.
         """
-        write_video(self._folder / VIDEO_FILE, read_frames(self._folder / FRAMES_FOLDER))
+        self._end = self._end or (outcome, reason)
+        self._write()
+
+    def finish(self, *, video: bool = True) -> dict[str, Any]:
+        """Write the video, if one is wanted, and return the report.
+
+        Raises:
+            CannotWrite: if the disk refuses.
+        """
+        if video:
+            write_video(self._folder / VIDEO_FILE, read_frames(self._folder / FRAMES_FOLDER))
         return self._write()
 
     def close(self) -> None:
@@ -201,7 +217,8 @@ class EpisodeRecord:
         self.seconds, self.steps_written = round(self._seconds, 2), len(self._steps)
         report = self._report()
         write_json(self._folder / REPORT_FILE, report)
-        write_trajectory(self._folder / TRAJECTORY_FILE, self._course.trajectory)
+        if self._course is not None:
+            write_trajectory(self._folder / TRAJECTORY_FILE, self._course.trajectory)
         self._write_csv()
         return report
 
@@ -212,36 +229,48 @@ class EpisodeRecord:
     def _step_entry(self, event: Stepped) -> dict[str, Any]:
         """A step as the report has it; lengths in mm, angles in degrees; None for what is not known."""
         assert self._image is not None
-        truth, estimate = self._table.truth(), event.estimate
-        off = np.linalg.norm(estimate.state.poses.position - truth.poses.position, axis=1)
+        estimate, names = event.estimate, event.estimate.state.names
         entry = {
             "step": event.number,
             "seconds": {stage: round(value, 4) for stage, value in event.seconds.items()},
             "image_cost": event.image_cost,
             "ssim": round(ssim(self._image.image, event.rendered), 4),
-            "to_goal_mm": by_name(truth.names, 1000 * event.offsets_m) if event.offsets_m.size else None,
-            "to_goal_deg": by_name(truth.names, np.rad2deg(event.offsets_rad)) if event.offsets_rad.size else None,
-            "estimate_off_mm": by_name(truth.names, 1000 * off),
-            "light_off_deg": round(float(np.rad2deg(estimate.state.light.angle_to(truth.light))), 3),
+            "to_goal_mm": by_name(names, 1000 * event.offsets_m) if event.offsets_m.size else None,
+            "to_goal_deg": by_name(names, np.rad2deg(event.offsets_rad)) if event.offsets_rad.size else None,
             "estimate": estimated_to_json(estimate),
+        }
+        if self._table is None:
+            return entry
+        truth = self._table.truth()
+        off = np.linalg.norm(estimate.state.poses.position - truth.poses.position, axis=1)
+        entry |= {
+            "estimate_off_mm": by_name(names, 1000 * off),
+            "light_off_deg": round(float(np.rad2deg(estimate.state.light.angle_to(truth.light))), 3),
             "truth": state_to_json(truth),
         }
         if self._about.goal is not None:
-            entry["truly_to_goal_mm"] = by_name(truth.names, 1000 * _shift(truth, self._about.goal))
+            entry["truly_to_goal_mm"] = by_name(names, 1000 * _shift(truth, self._about.goal))
         return entry
 
     def _draw(self, event: Stepped) -> None:
         assert self._image is not None
-        assert self._views is not None
-        camera = self._image.camera
-        scale = TILE_PX / max(camera.width, camera.height)
-        now = self._table.photo(camera.resized(round(scale * camera.width), round(scale * camera.height)))
+        assert self._seen is not None
         title = f"step {event.number} of {event.steps}"
-        picture = frame(self._image.image, now, event.rendered, self._views, title, self._photo)
+        now = self._now(self._image.camera)
+        picture = frame(self._image.image, now, event.rendered, self._seen.images, title, self._photo)
         write_png(self._folder / FRAMES_FOLDER / f"{len(self._steps) - 1:03d}.png", picture)
 
+    def _now(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+        """Return what the goal's camera sees now: in a simulation, or as one of the robot's; else the first one's."""
+        if self._table is not None:
+            scale = TILE_PX / max(camera.width, camera.height)
+            return self._table.photo(camera.resized(round(scale * camera.width), round(scale * camera.height)))
+        assert self._seen is not None
+        names = [seen.name for seen in self._seen.cameras]
+        return self._seen.images[names.index(camera.name) if camera.name in names else 0]
+
     def _write_csv(self) -> None:
-        names = self._start.names
+        names = self._about.names
         keys = ("to_goal_mm", "to_goal_deg", "estimate_off_mm", "truly_to_goal_mm")
         present = [key for key in keys if self._steps and self._steps[0].get(key) is not None]
         stages = ("first", "goal", "estimate", "plan", "act")
@@ -256,31 +285,41 @@ class EpisodeRecord:
         write_atomically(self._folder / CSV_FILE, text.getvalue().encode())
 
     def _report(self) -> dict[str, Any]:
-        end, about = self._end, self._about
+        about, (outcome, text) = self._about, self._end or (None, None)
         report: dict[str, Any] = {
-            "outcome": None if end is None else end.outcome,
-            "text": None if end is None else end.text,
+            "outcome": outcome,
+            "text": text,
             "steps_done": len(self._actions),
             "seconds": self.seconds,
+            **about.robot(),
             "seed": about.seed,
-            "objects": list(self._start.names),
+            "objects": list(about.names),
             "method": about.method,
             "settings": asdict(about.settings),
             "goal": None if self._goal is None else goal_to_json(self._goal),
             "noticed": self._notices,
             "actions": self._actions,
-            "step_s": [round(at_s, 3) for at_s in ReplayClock(self._course.trajectory).step_s],
             "steps": self._steps,
         }
+        if self._course is not None:
+            report["step_s"] = [round(at_s, 3) for at_s in ReplayClock(self._course.trajectory).step_s]
         if about.parts is not None:
             report["parts"] = about.parts.to_json()
         if about.goal is not None:
             report["moved"] = list(about.moved)
-        if about.goal is not None and about.moved:  # else there is nothing to score
+        if about.goal is not None and about.moved and self._table is not None and self._start is not None:
             task = RearrangementTask(0, self._start, about.goal, about.moved)
             score = score_of(task, self._table.truth(), about.symmetries)
             report["score"], report["success_2cm"] = score.to_json(), score.is_success()
         return report
+
+
+def recorded(events: Iterable[Event], record: EpisodeRecord) -> Iterator[Event]:
+    """Yield the events of an episode, each of them recorded first; what the caller does meanwhile takes no time."""
+    for event in events:
+        record.take(event)
+        yield event
+        record.go_on()
 
 
 def by_name(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:

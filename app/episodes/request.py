@@ -13,14 +13,15 @@ from jaxtyping import Float
 from PIL import Image
 
 from app.episodes.file_names import RECORDING_FILE
-from app.episodes.progress import note_of
-from app.episodes.record import About, EpisodeRecord, PartNames
+from app.episodes.progress import EpisodeProgress
+from app.episodes.record import About, EpisodeRecord, PartNames, recorded
 from osfcore.control.closed_loop import Episode
 from osfcore.control.estimators import ESTIMATOR, ESTIMATORS, EpisodeParts, load_scene_models
-from osfcore.control.events import ActionExecuted, EpisodeSettings, Event, Stepped
+from osfcore.control.events import EpisodeSettings, Event
 from osfcore.control.goal import GoalImage
 from osfcore.control.world import SimulatedWorld
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
+from osfcore.fields.devices import use_one_thread
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, goal_camera
 from osfcore.geometry.light import Light
@@ -229,20 +230,14 @@ def parts_of(names: PartNames, data_dir: Path) -> EpisodeParts:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class EpisodeStep:
+class EpisodeStep(EpisodeProgress):
     """How far an episode is.
 
     Attributes:
-        done: actions executed.
-        total: actions at most, as known so far.
-        note: what is being done.
         event: what just happened, if anything did.
         report: with the last step only.
     """
 
-    done: int
-    total: int
-    note: str
     event: Event | None = None
     report: dict[str, Any] | None = None
 
@@ -255,28 +250,26 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
     """
     from app.episodes.recording import write_recording
 
-    total = order.settings.steps
-    yield EpisodeStep(0, total, "Loading fields and setting the table")
+    step = EpisodeStep(0, order.settings.steps, "Loading fields and setting the table")
+    yield step
+    use_one_thread()
     parts, begin = parts_of(order.parts, order.data_dir), given(order)
     try:
         assets = AssetLibrary(order.data_dir / "objects")
         names = begin.world.truth().names
         models = load_scene_models(names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device)
         symmetries = {name: assets.info(name).symmetry for name in names}
-        about = About(order.seed, order.settings, begin.truth, begin.moved, symmetries, parts=order.parts)
+        about = About(names, order.seed, order.settings, begin.truth, begin.moved, symmetries, parts=order.parts)
         record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
         rng = stream_rng(order.seed, Stream.EPISODE)
-        done, note = 0, ""
+        events = Episode(begin.world, models, begin.goal, order.settings, rng, parts=parts).run()
         with contextlib.closing(record):
-            for event in Episode(begin.world, models, begin.goal, order.settings, rng, parts=parts).run():
-                record.take(event)
-                done = event.number if isinstance(event, ActionExecuted) else done
-                total = event.steps if isinstance(event, Stepped) else total
-                note = note_of(event) or note
-                yield EpisodeStep(done, total, note, event)
-        yield EpisodeStep(done, total, "Writing video and recording")
+            for event in recorded(events, record):
+                step = replace(step.after(event), event=event)
+                yield step
+        yield replace(step, note="Writing video and recording", event=None)
         report = record.finish()
         write_recording(order.out / RECORDING_FILE, assets, record.states)
-        yield EpisodeStep(done, total, str(report["text"]), report=report)
+        yield replace(step, event=None, report=report)
     finally:
         begin.world.close()

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,35 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from app.episodes.file_names import FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, STOPPED, VIDEO_FILE
-from app.episodes.frames import frame, read_frames, write_video
-from app.episodes.record import by_name, goal_to_json
+from app.episodes.file_names import STOPPED
+from app.episodes.record import About, EpisodeRecord, recorded
 from osfcore.contrib.robots.connect import connect
 from osfcore.contrib.robots.guarded_world import CameraBoxes, GuardedWorld, OutlinedWorld
 from osfcore.contrib.robots.robot import RobotDescription, SafetyLimits
 from osfcore.control.closed_loop import Episode
 from osfcore.control.estimators import load_scene_models
-from osfcore.control.events import (
-    ActionExecuted,
-    EpisodeSettings,
-    Event,
-    Finished,
-    GoalFound,
-    Noticed,
-    Observed,
-    Stepped,
-)
+from osfcore.control.events import EpisodeSettings, Event
 from osfcore.control.goal import GoalImage
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.estimation.camera_response import Encoding, linear_from_encoded
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
-from osfcore.io.files import write_json
-from osfcore.io.image_file import to_uint8, write_png
-from osfcore.io.scene_file import estimated_to_json
-from osfcore.metrics.image_errors import ssim
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.photo.read_photograph import read_photograph
 from osfcore.random_streams import Stream, stream_rng
@@ -111,11 +95,8 @@ class RobotDrive:
         self._guard = GuardedWorld(robot, self.limits, permit)
         world, rng = OutlinedWorld(self._guard, order.boxes), stream_rng(order.seed, Stream.EPISODE)
         self._episode = Episode(world, models, goal, order.settings, rng)
-        about = {
-            "robot": order.url, "objects": list(order.names), "seed": order.seed,
-            "limits": asdict(self.limits), "settings": asdict(order.settings),
-        }  # fmt: skip
-        self._record = RobotRecord(order.out, about, self._guard)
+        about = About(order.names, order.seed, order.settings, robot=lambda: self._told(order.url))
+        self._record = EpisodeRecord(order.out, None, about)
 
     def stop(self, reason: str) -> None:
         """Stop the robot for good; from any thread."""
@@ -129,13 +110,12 @@ class RobotDrive:
             OsfError: if the robot no longer answers, or what it sends cannot be used.
         """
         try:
-            for event in self._episode.run():
-                self._record.take(event)
+            for event in recorded(self._episode.run(), self._record):
                 yield event
                 self._guard.check()
         except BaseException as error:
             self._guard.stop(str(error) or "it was interrupted")  # before anything is written
-            self._record.break_off(str(error) or "It was interrupted.")
+            self._record.break_off(STOPPED, str(error) or "It was interrupted.")
             raise
 
     def finish(self) -> dict[str, Any]:
@@ -144,11 +124,16 @@ class RobotDrive:
         Raises:
             CannotWrite: if the disk refuses.
         """
-        return self._record.finish()
+        return self._record.finish(video=find_spec("imageio_ffmpeg") is not None)
 
     def close(self) -> None:
         """Stop the robot and let it go."""
         self._guard.close()
+
+    def _told(self, url: str) -> dict[str, Any]:
+        """Return what the report says of the robot."""
+        held_back = [{"action": h.action.tolist(), "done": h.done.tolist()} for h in self._guard.held_back]
+        return {"robot": url, "limits": asdict(self.limits), "held_back": held_back}
 
 
 def read_goal_photo(order: DriveOrder, cameras: tuple[Camera, ...]) -> GoalImage:
@@ -179,113 +164,3 @@ def doubts_about(robot: RobotDescription) -> tuple[str, ...]:
         return ()
     differs = f"The robot's pusher has a radius of {1000 * radius_m:.0f} mm"
     return (f"{differs}; pushes are predicted for one of {1000 * PUSHER_RADIUS_M:.0f} mm.",)
-
-
-class RobotRecord:
-    """What an episode leaves in its folder: report.json, the goal, frames and a video, written as events come.
-
-    Whoever breaks off has what was done until then.
-
-    Args:
-        folder: for them.
-        about: what the report says besides what happens.
-        guard: of the robot, which knows what was held back.
-    """
-
-    def __init__(self, folder: Path, about: Mapping[str, Any], guard: GuardedWorld) -> None:
-        self._folder, self._about, self._guard = folder, about, guard
-        self._began = time.perf_counter()
-        self._seen: Observation | None = None
-        self._goal: GoalFound | None = None
-        self._steps: list[dict[str, Any]] = []
-        self._notices: list[dict[str, Any]] = []
-        self._actions: list[list[float]] = []
-        self._outcome: tuple[str, str] | None = None
-        for left in (folder / FRAMES_FOLDER).glob("[0-9]*.png"):  # of an earlier, perhaps longer episode
-            left.unlink()
-
-    def take(self, event: Event) -> None:
-        """Note an event, and draw a frame where a step is over.
-
-        Raises:
-            CannotWrite: if the disk refuses.
-        """
-        match event:
-            case Observed():
-                self._seen = event.observation
-            case GoalFound():
-                self._goal = event
-                write_png(self._folder / GOAL_FILE, to_uint8(event.image))
-            case ActionExecuted():
-                self._actions.append(event.action.tolist())
-            case Noticed():
-                self._notices.append({"step": event.number, "matter": event.matter, "text": event.text})
-            case Stepped():
-                self._draw(event)
-                self._steps.append(self._step_entry(event))
-            case Finished():
-                self._outcome = event.outcome, event.text
-            case _:
-                return
-        if not isinstance(event, Observed):
-            self._write()
-
-    def break_off(self, reason: str) -> None:
-        """Note that the episode ended before its end, unless that has come.
-
-        Raises:
-            CannotWrite: if the disk refuses.
-        """
-        self._outcome = self._outcome or (STOPPED, reason)
-        self._write()
-
-    def finish(self) -> dict[str, Any]:
-        """Write the video, where ffmpeg is there, and return the report.
-
-        Raises:
-            CannotWrite: if the disk refuses.
-        """
-        if find_spec("imageio_ffmpeg") is not None:
-            write_video(self._folder / VIDEO_FILE, read_frames(self._folder / FRAMES_FOLDER))
-        return self._write()
-
-    def _step_entry(self, event: Stepped) -> dict[str, Any]:
-        """Return the report of a step: estimated lengths in mm and angles in degrees, None where unknown."""
-        names = event.estimate.state.names
-        assert self._goal is not None
-        return {
-            "step": event.number,
-            "seconds": {stage: round(value, 4) for stage, value in event.seconds.items()},
-            "image_cost": event.image_cost,
-            "ssim": round(ssim(self._goal.image, event.rendered), 4),
-            "to_goal_mm": by_name(names, 1000 * event.offsets_m) if event.offsets_m.size else None,
-            "to_goal_deg": by_name(names, np.rad2deg(event.offsets_rad)) if event.offsets_rad.size else None,
-            "estimate": estimated_to_json(event.estimate),
-        }
-
-    def _draw(self, event: Stepped) -> None:
-        """Draw a frame, with what the goal's camera sees now if it is one of the robot's, else the first one."""
-        assert self._seen is not None
-        assert self._goal is not None
-        names, name = [camera.name for camera in self._seen.cameras], self._goal.camera.name
-        now = self._seen.images[names.index(name) if name in names else 0]
-        title = f"step {event.number} of {event.steps}"
-        picture = frame(self._goal.image, now, event.rendered, self._seen.images, title)
-        write_png(self._folder / FRAMES_FOLDER / f"{len(self._steps):03d}.png", picture)
-
-    def _write(self) -> dict[str, Any]:
-        outcome, text = self._outcome or (None, None)
-        report = {
-            "outcome": outcome,
-            "text": text,
-            "steps_done": len(self._actions),
-            "seconds": round(time.perf_counter() - self._began, 2),
-            **self._about,
-            "goal": None if self._goal is None else goal_to_json(self._goal),
-            "noticed": self._notices,
-            "actions": self._actions,
-            "held_back": [{"action": h.action.tolist(), "done": h.done.tolist()} for h in self._guard.held_back],
-            "steps": self._steps,
-        }
-        write_json(self._folder / REPORT_FILE, report)
-        return report

@@ -17,7 +17,6 @@ from typing import Literal, Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
-from app.processes.plan_summary import PlanSketch, sketch_of
 from osfcore.control.events import ActionExecuted, Event, GoalFound, Looking, Planning, Stepped
 from osfcore.errors import CorruptFile
 from osfcore.estimation.steps import EstimateStep
@@ -31,6 +30,34 @@ from osfcore.planning.mppi import PlanRound
 
 LookAt = Literal["first", "goal"]
 LOOKS: tuple[LookAt, ...] = ("first", "goal")
+
+
+WAYS = 24  # of the pusher that are kept
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlanSketch:
+    """A round of planning, as much of it as a picture shows.
+
+    Attributes:
+        step: actions executed so far.
+        ways: where the pusher would go, cheapest first [m].
+        costs: theirs, ascending.
+        best: the cheapest future, K = 1.
+    """
+
+    step: int
+    ways: Float[np.ndarray, "W T1 2"]
+    costs: Float[np.ndarray, "W"]
+    best: Rollouts
+
+
+def sketch_of(step: int, round_: PlanRound) -> PlanSketch:
+    """The best future, and ways spread evenly from the cheapest to the dearest."""
+    order = np.argsort(round_.costs, kind="stable")
+    chosen = order[np.round(np.linspace(0, len(order) - 1, min(WAYS, len(order)))).astype(int)]
+    ways = round_.rollouts.pusher[chosen, :, :2].astype(np.float32)
+    return PlanSketch(step, ways, round_.costs[chosen], round_.best)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

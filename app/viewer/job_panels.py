@@ -12,9 +12,9 @@ from functools import partial
 
 import viser
 
+from app.episodes.trajectory import PlanSketch
 from app.jobs.job import Job, JobChanged, JobView
 from app.processes.messages.scene_messages import SceneChanged
-from app.processes.plan_summary import PlanSketch
 from app.services import episodes, estimates
 from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged

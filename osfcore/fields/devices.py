@@ -23,6 +23,16 @@ def pick_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def use_one_thread() -> None:
+    """Let torch work in one thread from now on, for the rollouts of a planner.
+
+    They are thousands of small products: a second thread hardly helps on an idle machine, and where the other core is
+    busy, with a page that draws the 3D view, say, each product waits for it. Renderer and estimator have threads of
+    their own.
+    """
+    torch.set_num_threads(1)
+
+
 @contextmanager
 def computing_threads(count: int) -> Iterator[None]:
     """Let torch and numba compute in that many threads of the processor, numba in no more than it has."""

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 from app.episodes.file_names import GOAL_FILE, PREPARED_FILE, RECORDING_FILE
+from app.episodes.progress import EpisodeProgress
 from app.jobs.job import INPUTS
 from app.jobs.kind import JobKind
 from osfcore.geometry.poses import Pose, rotation_angle
@@ -28,8 +29,8 @@ from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
+    from app.episodes.trajectory import PlanSketch
     from app.jobs.context import JobContext
-    from app.processes.plan_summary import PlanSketch
     from osfcore.control.estimators import SceneModels
     from osfcore.control.events import EpisodeSettings, Event
     from osfcore.control.goal import GoalImage
@@ -41,33 +42,21 @@ _STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not ha
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class EpisodeProgress:
-    """How far an episode is.
+class EpisodeStep(EpisodeProgress):
+    """How far an episode is; nothing of how long acting takes is known before it begins.
 
     Attributes:
-        done: actions executed.
-        total: actions at most; 0 until acting begins, for looking tells nothing of how long acting takes.
-        note: what is being done, for a person.
         share: of the episode that is over, from 0 to 1.
         left_s: time left, estimated [s]; None before it begins.
-        stage: which part of the loop is at work: "first", "goal", "plan", "act", "next" or "search"; None before it.
         steps: rounds whose results are in the report.
         seconds: spent so far, without pauses [s]; None before the first look.
-        outcome: how it ended; only at the end.
-        text: the same in a sentence.
         view: what just happened, as a picture shows it.
     """
 
-    done: int
-    total: int
-    note: str
     share: float = 0.0
     left_s: float | None = None
-    stage: str | None = None
     steps: int = 0
     seconds: float | None = None
-    outcome: str | None = None
-    text: str | None = None
     view: Event | PlanSketch | None = None
 
     @property
@@ -85,7 +74,7 @@ class EpisodeProgress:
         return self.view is not None and not isinstance(self.view, Looking)
 
 
-def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeProgress]:
+def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeStep]:
     """Run an episode.
 
     Raises:
@@ -93,18 +82,19 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     """
     from app.episodes.look_pictures import LookPictures
     from app.episodes.progress import TimeLeft
-    from app.episodes.record import About, EpisodeRecord
+    from app.episodes.record import About, EpisodeRecord, recorded
     from app.episodes.recording import write_recording
     from app.episodes.settings import ChosenSettings
     from app.jobs.kinds.remote_world import RemoteWorld
     from osfcore.control.closed_loop import Episode
     from osfcore.control.goal import GoalImage
+    from osfcore.fields.devices import use_one_thread
 
     assert place.orders is not None, "the job's process sets it"
     use_one_thread()
     chosen, names = ChosenSettings.of_job(params), tuple(params["names"])
     settings, method = chosen.of_loop(), chosen.method
-    yield EpisodeProgress(0, 0, "Loading fields, half a minute the first time")
+    yield EpisodeStep(0, 0, "Loading fields, half a minute the first time")
     models = _models(method, names, place)
     world = RemoteWorld(place.orders.ask, params["scene"])
     goal, start = params["goal"], world.truth()
@@ -113,27 +103,25 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodePr
     wanted, prepared = _goal(goal, names, inputs), _prepared(inputs / PREPARED_FILE)
     image = wanted if method == "paper" else None
     assert image is None or isinstance(image, GoalImage), "the service renders poses for it"
-    about = About(params["seed"], settings, target, _moved(start, target), models.symmetries, method, image)
+    about = About(names, params["seed"], settings, target, _moved(start, target), models.symmetries, method, image)
     record = EpisodeRecord(place.folder, world, about)
     if image is None:
         loop = Episode(world, models, wanted, settings, rng, prepared=prepared)
     else:
         loop = _Published(world, models, image, settings, rng)
-    progress, timer = EpisodeProgress(0, 0, "Looking"), TimeLeft(finds_goal=image is None)
+    progress, timer = EpisodeStep(0, 0, "Looking"), TimeLeft(finds_goal=image is None)
     pictures = LookPictures(models.appearance.together, wanted)
     with contextlib.closing(record):
-        for event in loop.run():
+        for event in recorded(loop.run(), record):
             for change in place.orders.changes():
                 loop.settings = ChosenSettings.of_job(change).of_loop()
-            record.take(event)
             share, left_s = timer.take(event, progress.total or settings.steps)
-            then = _progress_after(progress, pictures.drawn(event))
             progress = replace(
-                then, share=share, left_s=round(left_s, 1), seconds=record.seconds, steps=record.steps_written
-            )
+                progress.after(event), share=share, left_s=round(left_s, 1), seconds=record.seconds,
+                steps=record.steps_written, view=_drawn(pictures.drawn(event)),
+            )  # fmt: skip
             yield progress
             timer.go_on()  # not before a pause is over
-            record.go_on()
     yield replace(progress, note="Writing video and recording", view=None)
     record.finish()
     write_recording(place.folder / RECORDING_FILE, place.library, record.states)
@@ -179,38 +167,18 @@ class _Published:
         return run_algorithm(self.world, self.models, self.goal, how, PaperEstimators(), self.rng)
 
 
-def use_one_thread() -> None:
-    """Let torch work in one thread, for the rollouts of a planner.
+def _drawn(event: Event) -> Event | PlanSketch | None:
+    """Return what a picture shows of an event."""
+    from app.episodes.trajectory import sketch_of
+    from osfcore.control.events import Observed, Planning
 
-    They are thousands of small products: a second thread hardly helps on an idle machine, and where the other core is
-    busy, with a page that draws the 3D view, say, each product waits for it. Renderer and estimator have threads of
-    their own.
-    """
-    import torch
-
-    torch.set_num_threads(1)
-
-
-def _progress_after(before: EpisodeProgress, event: Event) -> EpisodeProgress:
-    """How far an episode is after an event."""
-    from app.episodes.progress import note_of, stage_of
-    from app.processes.plan_summary import sketch_of
-    from osfcore.control.events import ActionExecuted, Finished, Observed, Planning, Stepped
-
-    then = replace(before, note=note_of(event) or before.note, stage=stage_of(event) or before.stage)
     match event:
         case Observed():  # its images are on the page already
-            return replace(then, view=None)
+            return None
         case Planning(number, round_):
-            return replace(then, view=sketch_of(number, round_))
-        case ActionExecuted(number):
-            return replace(then, done=number, view=event)
-        case Stepped():
-            return replace(then, total=event.steps, view=event)
-        case Finished(_, outcome, text):
-            return replace(then, outcome=outcome, text=text, note=text, view=event)
+            return sketch_of(number, round_)
         case _:
-            return replace(then, view=event)
+            return event
 
 
 def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> GoalImage | PoseGoal:

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import quote
 
 from app.episodes.file_names import CAMERAS_FOLDER, GOAL_FILE, REPORT_FILE, STOPPED
+from app.episodes.progress import EpisodeProgress
 from app.jobs.job import INPUTS, Job
 from app.jobs.kind import JobKind
-from app.jobs.kinds.episodes import use_one_thread
 from osfcore.contrib.robots.robot import ConnectionLost, SafetyLimits
 from osfcore.errors import OsfError
 from osfcore.estimation.camera_response import srgb_of_linear
@@ -28,7 +28,6 @@ from osfcore.io.image_file import encode_jpeg, to_uint8
 if TYPE_CHECKING:
     from app.episodes.robot import DriveOrder, RobotDrive
     from app.jobs.context import JobContext
-    from osfcore.control.events import Event
     from osfcore.geometry.states import Observation
 
 Drives = Literal["looking", "asked", "driving", "over", "lost"]
@@ -36,26 +35,16 @@ _CANCELLED = "somebody stopped it"
 _CANCELLED_SENTENCE = "The robot was stopped: its job was cancelled."
 
 
-@dataclass(frozen=True, slots=True)
-class RobotProgress:
+@dataclass(frozen=True, eq=False, slots=True)
+class RobotProgress(EpisodeProgress):
     """How far an episode with a robot is.
 
     Attributes:
-        done: actions executed.
-        total: actions at most.
-        note: what is being done, for a person.
         drives: "looking" before anything may move, "asked" while a person is waited for, "driving", or how it ended.
-        outcome: how it ended; only at the end.
-        text: the same in a sentence.
         doubts: what a person should know before the robot moves.
     """
 
-    done: int
-    total: int
-    note: str
     drives: Drives = "looking"
-    outcome: str | None = None
-    text: str | None = None
     doubts: tuple[str, ...] = ()
 
     @property
@@ -71,6 +60,7 @@ def robot_job(params: dict[str, Any], place: JobContext) -> Iterator[RobotProgre
         OsfError: if the order cannot be met, the robot does not answer or was stopped, or the disk refuses.
     """
     from app.episodes.robot import RobotDrive
+    from osfcore.fields.devices import use_one_thread
 
     assert place.orders is not None, "the job's process sets it"
     use_one_thread()
@@ -94,12 +84,14 @@ def robot_job(params: dict[str, Any], place: JobContext) -> Iterator[RobotProgre
 def _driven(
     drive: RobotDrive, progress: RobotProgress, may_move: threading.Event, place: JobContext
 ) -> Iterator[RobotProgress]:
-    from osfcore.control.events import Observed, Planning
+    from osfcore.control.events import Finished, Observed, Planning
 
     assert place.orders is not None
     progress = replace(progress, doubts=drive.doubts)
     for event in drive.run():
-        progress = _after(progress, event)
+        progress = progress.after(event)
+        if isinstance(event, Finished):
+            progress = replace(progress, drives="over")
         if isinstance(event, Observed):
             write_pictures(place.folder, event.observation)
         yield progress
@@ -111,22 +103,6 @@ def _driven(
                     may_move.set()
             progress = replace(progress, drives="driving")
             yield progress
-
-
-def _after(progress: RobotProgress, event: Event) -> RobotProgress:
-    from app.episodes.progress import note_of
-    from osfcore.control.events import ActionExecuted, Finished, Stepped
-
-    progress = replace(progress, note=note_of(event) or progress.note)
-    match event:
-        case ActionExecuted(number):
-            return replace(progress, done=number)
-        case Stepped():
-            return replace(progress, total=event.steps)
-        case Finished(_, outcome, text):
-            return replace(progress, drives="over", outcome=outcome, text=text, note=text)
-        case _:
-            return progress
 
 
 def _order(params: dict[str, Any], place: JobContext) -> DriveOrder:

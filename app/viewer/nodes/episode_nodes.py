@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from jaxtyping import Float, UInt8
 
-from app.processes.plan_summary import PlanSketch
+from app.episodes.trajectory import PlanSketch
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of
 from app.viewer.nodes.room import NO_LINES, Colour, Label, Target, atomic

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from app.cli.main import main
 from app.episodes.file_names import FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
 from app.episodes.mcap import write_mcap
-from app.episodes.trajectory import Round, Trajectory, write_trajectory
-from app.processes.plan_summary import PlanSketch
+from app.episodes.trajectory import PlanSketch, Round, Trajectory, write_trajectory
 from osfcore.extras import MissingExtra
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light

@@ -51,7 +51,7 @@ class Told:
 
     def record(self, truth, moved=(BOX,), **more):
         symmetries = {name: asset.info.symmetry for name, asset in self.world.assets.items()}
-        about = About(5, EpisodeSettings(steps=9), truth, moved, symmetries)
+        about = About(NAMES, 5, EpisodeSettings(steps=9), truth, moved, symmetries)
         return EpisodeRecord(self.out, SimulatedTable(self.world), about, **more)
 
     def begin(self, record):
@@ -293,7 +293,7 @@ def test_a_method_that_looks_at_images_alone_leaves_all_but_the_distances(told):
     symmetries = {name: asset.info.symmetry for name, asset in told.world.assets.items()}
     goal = GoalImage(goal_camera(SIDE), told.image)
     record = EpisodeRecord(
-        told.out, SimulatedTable(told.world), About(5, EpisodeSettings(), None, (), symmetries, "paper", goal)
+        told.out, SimulatedTable(told.world), About(NAMES, 5, EpisodeSettings(), None, (), symmetries, "paper", goal)
     )
     record.take(Observed(0, told.world.observe()))
     unknown, estimate = np.zeros(0), sure(told.world.truth())

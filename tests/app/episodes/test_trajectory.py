@@ -7,6 +7,7 @@ from app.episodes.trajectory import (
     PLAN_S,
     REST_S,
     LookFrame,
+    PlanSketch,
     ReplayClock,
     Round,
     Trajectory,
@@ -14,7 +15,6 @@ from app.episodes.trajectory import (
     read_trajectory,
     write_trajectory,
 )
-from app.processes.plan_summary import PlanSketch
 from osfcore.control.events import ActionExecuted, Looking, Observed, Stepped
 from osfcore.errors import CorruptFile
 from osfcore.estimation.steps import EstimateStep

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.episodes.trajectory import PlanSketch
 from app.jobs.job import Job, JobChanged, JobView, State
 from app.processes.messages.scene_messages import SceneChanged
-from app.processes.plan_summary import PlanSketch
 from app.services.event_hub import CurrentScene
 from app.services.goals import Draft, DraftChanged
 from app.viewer.job_panels import EPISODE_INTERVAL_S, EpisodePanel

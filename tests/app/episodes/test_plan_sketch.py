@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.processes.plan_summary import WAYS, sketch_of
+from app.episodes.trajectory import WAYS, sketch_of
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.planning.mppi import PlanRound
 
