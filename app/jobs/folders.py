@@ -10,7 +10,7 @@ from pathlib import Path
 
 from app.jobs.job import INPUTS
 from app.storage.database import CannotStore
-from osfcore.io.files import put_in_place
+from osfcore.io.files import put_in_place, sync
 
 _TEMPORARY_PREFIX = ".new-"
 
@@ -59,6 +59,7 @@ class JobFolders:
         try:
             if self.folder(job).is_dir():
                 self.folder(job).rename(aside)
+                sync(self._root)  # or the files would be there again after a power failure
         except OSError as error:
             raise CannotStore(self.folder(job), error.strerror or str(error)) from error
         return aside

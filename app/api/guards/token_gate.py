@@ -7,6 +7,7 @@ another token ends them all.
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import secrets
 import time
@@ -57,7 +58,33 @@ OPEN = ("/api/health",)  # whoever runs the service may look whether it lives
 _REFUSED = "This service needs a token: open its page as /?token=TOKEN, or send the header Authorization: Bearer TOKEN."
 _TOO_MANY = "Too many wrong tokens have come in; wait a moment before the next one."
 _WRONG_PER_S, _WRONG_AT_ONCE = 0.2, 10.0  # from one address
-_MOST_ADDRESSES = 1000
+_MOST_ADDRESSES, _MOST_REMEMBERED = 1000, 100
+
+
+class WrongTokens:
+    """The wrong tokens of one address: guesses are limited, the same mistake made again and again is not.
+
+    People behind one router have one address: a program there that was given a wrong token must not keep the others
+    out.
+    """
+
+    def __init__(self) -> None:
+        self._limit = RateLimit(_WRONG_PER_S, _WRONG_AT_ONCE)
+        self._seen: OrderedDict[bytes, None] = OrderedDict()  # digests of them, the latest last
+
+    def take(self, token: bytes) -> None:
+        """Note a wrong token."""
+        digest = hashlib.sha256(token).digest()
+        if digest not in self._seen:
+            self._limit.take()
+        self._seen[digest] = None
+        self._seen.move_to_end(digest)
+        if len(self._seen) > _MOST_REMEMBERED:
+            self._seen.popitem(last=False)
+
+    def are_too_many(self, token: bytes) -> bool:
+        """Return whether too many different ones have come for another token to be looked at."""
+        return self._limit.is_empty and hashlib.sha256(token).digest() not in self._seen
 
 
 class TokenMiddleware:
@@ -72,7 +99,7 @@ class TokenMiddleware:
         self._app = app
         self._token = token.encode()
         self._signer = TimestampSigner(self._token, salt="osf-session")
-        self._wrong: OrderedDict[str, RateLimit] = OrderedDict()  # by address of the client
+        self._wrong: OrderedDict[str, WrongTokens] = OrderedDict()  # by address of the client
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Check and pass on one request."""
@@ -84,25 +111,25 @@ class TokenMiddleware:
         given = _in_header(connection) if login is None else login
         if self._is_session(connection.cookies.get(COOKIE, "")) and login is None:
             await self._app(scope, receive, send)
-        elif given is not None and self._wrong_from(scope).is_empty:
+        elif given is not None and self._wrong_from(scope).are_too_many(given):
             await _refuse(429, _TOO_MANY, {"Retry-After": "5"})(scope, receive, send)
         elif given is None or not hmac.compare_digest(given, self._token):
             if given is not None:
-                self._wrong_from(scope).take()
+                self._wrong_from(scope).take(given)
             await _refuse(401, _REFUSED, {"WWW-Authenticate": "Bearer"})(scope, receive, send)
         elif login is None:
             await self._app(scope, receive, send)
         else:
             await self._logged_in(scope)(scope, receive, send)
 
-    def _wrong_from(self, scope: Scope) -> RateLimit:
-        """The limit of wrong tokens from the address that a request comes from."""
+    def _wrong_from(self, scope: Scope) -> WrongTokens:
+        """Return the wrong tokens from the address that a request comes from."""
         address = (scope.get("client") or ("",))[0]
-        limit = self._wrong.setdefault(address, RateLimit(_WRONG_PER_S, _WRONG_AT_ONCE))
+        wrong = self._wrong.setdefault(address, WrongTokens())
         self._wrong.move_to_end(address)
         if len(self._wrong) > _MOST_ADDRESSES:
             self._wrong.popitem(last=False)
-        return limit
+        return wrong
 
     def _is_session(self, cookie: str) -> bool:
         try:

@@ -127,6 +127,13 @@ def test_inputs_of_a_job_outlive_a_power_failure(tmp_path, synced):
     assert (tmp_path / "collections").stat().st_ino in synced
 
 
+def test_files_of_a_forgotten_job_stay_away_after_a_power_failure(tmp_path, synced):
+    folders = JobFolders(tmp_path)
+    folders.folder("j").mkdir(parents=True)
+    aside = folders.put_aside("j")
+    assert (tmp_path / "collections").stat().st_ino in synced[synced.index(aside.name) :]
+
+
 def test_a_deleted_set_of_images_stays_deleted_after_a_power_failure(tmp_path, synced):
     facts = {"id": "s", "file_name": "s.zip", "created_at": "2026", "train": 1, "test": 1, "summary": ""}
     write_atomically(tmp_path / "sets" / "s" / "set.json", json.dumps(facts).encode())

@@ -94,13 +94,19 @@ def test_a_token_may_have_any_characters(token):
 
 def test_wrong_tokens_are_limited_and_sessions_are_not(client):
     client.get(f"/?token={TOKEN}")
-    wrong = {"Authorization": "Bearer wrong-one"}
     other = TestClient(client.app, base_url="http://localhost")
-    statuses = [other.get("/", headers=wrong).status_code for _ in range(20)]
+    guesses = [{"Authorization": f"Bearer guess-{number}"} for number in range(20)]
+    statuses = [other.get("/", headers=guess).status_code for guess in guesses]
     assert statuses[0] == 401
     assert statuses[-1] == 429
     assert other.get("/", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 429
     assert client.get("/").status_code == 200
+
+
+def test_the_same_wrong_token_again_and_again_keeps_nobody_out(client):
+    wrong = {"Authorization": "Bearer of-yesterday"}
+    assert {client.get("/", headers=wrong).status_code for _ in range(30)} == {401}
+    assert client.get("/", headers={"Authorization": f"Bearer {TOKEN}"}).text == "inside"
 
 
 def test_a_wrong_token_in_the_address_sets_no_cookie(client):
