@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 from app.api.bodies import PNG, OpenFile, upload
 from app.api.dependencies import Services, ServicesDep
 from app.api.models import FileName, Identifier, Input
-from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, PageOut, page
+from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
 from app.api.problems import named_in_path, problems
 from app.services.fields import NoTrainedField
 from app.services.image_sets import SetRecord
@@ -65,6 +65,7 @@ class SetList(PageOut):
     """Uploaded image sets, oldest first."""
 
     sets: list[SetOut]
+    damaged: list[DamagedOut] = Field(description="What can only be deleted, on each page.")
 
 
 UPLOAD_PATH = "/api/fields/sets"
@@ -96,11 +97,13 @@ async def upload_set(
 @router.get("/sets")
 def list_sets(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> SetList:
     """List the uploaded image sets, oldest first."""
-    shown, total, following = page(services.runner.sets.all(), limit, after, newest_first=False)
-    return SetList(sets=[SetOut.of(record) for record in shown], total=total, next=following)
+    sets = services.runner.sets
+    shown, total, following = page(sets.all()[::-1], limit, after, newest_first=False)
+    damaged = [DamagedOut(id=each.id, reason=each.reason) for each in sets.damaged()]
+    return SetList(sets=[SetOut.of(record) for record in shown], damaged=damaged, total=total, next=following)
 
 
-@router.get("/sets/{set_id}", responses=problems(404))
+@router.get("/sets/{set_id}", responses=problems(404, 409))
 def get_set(services: ServicesDep, set_id: SetId) -> SetOut:
     """Tell what is in an uploaded image set."""
     return SetOut.of(_found_set(services, set_id))
@@ -108,12 +111,12 @@ def get_set(services: ServicesDep, set_id: SetId) -> SetOut:
 
 @router.delete("/sets/{set_id}", status_code=204, responses=problems(404, 409, 507))
 def delete_set(services: ServicesDep, set_id: SetId) -> None:
-    """Delete an uploaded image set."""
-    _found_set(services, set_id)
-    services.runner.remove_set(set_id)
+    """Delete an uploaded image set, damaged or not."""
+    with named_in_path():
+        services.runner.remove_set(set_id)
 
 
-@router.get("/sets/{set_id}/overlay.png", response_class=Response, responses={**problems(404), **PNG})
+@router.get("/sets/{set_id}/overlay.png", response_class=Response, responses={**problems(404, 409), **PNG})
 def overlay(services: ServicesDep, set_id: SetId) -> OpenFile:
     """Show how a set was understood: axes, light and the silhouettes' box, drawn into some of its images."""
     _found_set(services, set_id)

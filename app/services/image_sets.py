@@ -6,24 +6,21 @@ and `set.json`. It is made under another name beside its place, so that a set is
 
 from __future__ import annotations
 
-import contextlib
-import json
 import shutil
-import threading
 import uuid
 from collections.abc import AsyncIterator, Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field, StrictInt
 from starlette.concurrency import run_in_threadpool
 
-from app.storage.database import CannotStore, now_utc
+from app.storage.database import now_utc
+from app.storage.records import RecordFolders
 from app.storage.uploads import Examiner, save
-from osfcore.errors import CorruptFile, InvalidInput, NotThere, OsfError, shown
-from osfcore.io.files import put_in_place, read_json, remove_folder
-from osfcore.io.json_codec import Text, decode
+from osfcore.errors import CorruptFile, OsfError
+from osfcore.io.json_codec import Text
 
 _ARCHIVE, _IMAGES, _OVERLAY, _FACTS = "set.zip", "images", "overlay.png", "set.json"
 _TEMPORARY_PREFIX = ".new-"
@@ -63,6 +60,7 @@ class SetRecord:
         train: number of images to learn from.
         test: number of images that only measure.
         summary: the same in words.
+        number: orders the sets; the store gives it.
     """
 
     id: Text
@@ -71,9 +69,10 @@ class SetRecord:
     train: _Count
     test: _Count
     summary: Text
+    number: int = 0
 
 
-class ImageSets:
+class ImageSets(RecordFolders[SetRecord]):
     """The uploaded sets of one data directory. Any thread may call; uploads belong to the event loop.
 
     Args:
@@ -83,41 +82,13 @@ class ImageSets:
     """
 
     def __init__(self, root: Path, max_sets: int = 20, check_room: Callable[[], None] = lambda: None) -> None:
-        self._root = root
-        self._max_sets = max_sets
+        super().__init__(root, SetRecord, "image set", _FACTS, _OVERLAY, max_sets, TooManySets)
         self._check_storage = check_room
-        self._keeping = threading.Lock()
         self._examiner = Examiner(examine, "set", _names, _ARCHIVE)
-
-    def start(self) -> None:
-        """Remove what an earlier service left half done."""
-        for folder in self._root.glob(".*"):
-            shutil.rmtree(folder, ignore_errors=True)
 
     def stop(self) -> None:
         """End the process that looks at a set, if there is one. Calling it again does nothing."""
         self._examiner.stop()
-
-    def all(self) -> tuple[SetRecord, ...]:
-        """All sets, oldest first."""
-        if not self._root.is_dir():
-            return ()
-        records = []
-        for path in self._root.glob(f"[!.]*/{_FACTS}"):
-            with contextlib.suppress(CorruptFile, OSError):  # a damaged one must not hide the others
-                records.append(_read(path))
-        return tuple(sorted(records, key=lambda record: record.created_at))
-
-    def get(self, set_id: str) -> SetRecord:
-        """One set.
-
-        Raises:
-            UnknownName: if there is none.
-        """
-        for record in self.all():
-            if record.id == set_id:
-                return record
-        raise NotThere("image set")
 
     def folder(self, set_id: str) -> Path:
         """The folder with train and test of a set that exists."""
@@ -126,18 +97,6 @@ class ImageSets:
     def overlay(self, set_id: str) -> Path:
         """The picture of how a set was understood."""
         return self._root / set_id / _OVERLAY
-
-    def remove(self, set_id: str) -> None:
-        """Delete a set.
-
-        Raises:
-            UnknownName: if there is none.
-        """
-        self.get(set_id)
-        try:
-            remove_folder(self._root / set_id)
-        except OSError as error:
-            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
 
     async def receive(self, chunks: AsyncIterator[bytes], file_name: str) -> SetRecord:
         """Take in an uploaded zip, bit by bit, and keep the set in it if it is sound.
@@ -148,7 +107,7 @@ class ImageSets:
             UploadRefused: if it is no sound set of an object; nothing is kept.
             CannotStore: if the disk is full.
         """
-        await run_in_threadpool(self._check_room)
+        await run_in_threadpool(self.check_room)
         await run_in_threadpool(self._check_storage)
         set_id = uuid.uuid4().hex[:12]
         folder = self._root / f"{_TEMPORARY_PREFIX}{set_id}"
@@ -156,23 +115,9 @@ class ImageSets:
             await save(chunks, folder / _ARCHIVE)
             examined = await self._examiner.examine(folder)
             record = SetRecord(set_id, file_name, now_utc(), examined.train, examined.test, examined.summary)
-            await run_in_threadpool(self._keep, folder, record)
+            return await run_in_threadpool(self._keep, record, {}, folder)
         finally:
             await run_in_threadpool(shutil.rmtree, folder, True)
-        return record
-
-    def _check_room(self) -> None:
-        if len(self.all()) >= self._max_sets:
-            raise TooManySets(self._max_sets)
-
-    def _keep(self, folder: Path, record: SetRecord) -> None:
-        try:
-            (folder / _FACTS).write_text(json.dumps(asdict(record), indent=1) + "\n", encoding="utf-8")
-            with self._keeping:  # others may have come in since the upload began
-                self._check_room()
-                put_in_place(folder, self._root / record.id)
-        except OSError as error:
-            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
 
 
 def examine(folder: Path) -> Examined:
@@ -201,13 +146,3 @@ def _names(folder: Path) -> dict[str, str]:
         f"{folder / _IMAGES}/": "",
         f"{folder / _IMAGES}": "The uploaded set",
     }
-
-
-def _read(path: Path) -> SetRecord:
-    def parse(data: object) -> SetRecord:
-        record = decode(SetRecord, data, "image set")
-        if record.id != path.parent.name:
-            raise InvalidInput("id", shown(record.id), "the name of its folder")
-        return record
-
-    return read_json(path, parse)

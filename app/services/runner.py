@@ -229,14 +229,13 @@ class Runner:
         self.storage.outdate()
 
     def remove_set(self, set_id: str) -> None:
-        """Delete an uploaded image set.
+        """Delete an uploaded image set, damaged or not.
 
         Raises:
             UnknownName: if there is none.
             SetInUse: if a job needs it.
         """
         with self._ordering:
-            self.sets.get(set_id)
             for job in self.jobs.live("train_field"):
                 if job.params["source"]["set"] == set_id:
                     raise SetInUse(job)

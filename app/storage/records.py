@@ -1,4 +1,4 @@
-"""Goals and photographs of tables on disk: ROOT/ID with a JSON of facts and the files that belong to them.
+"""Goals, photographs and image sets on disk: ROOT/ID with a JSON of facts and the files that belong to them.
 
 The facts are the records themselves, as dataclasses that the JSON codec reads and writes.
 """
@@ -81,18 +81,25 @@ class RecordFolders(Generic[Record]):
     Args:
         root: the folder; made when the first record comes.
         kind: of the records, a dataclass that the JSON codec takes.
-        what: a record is, in sentences; "goal" for records whose facts are in `goal.json`.
+        what: a record is, in sentences.
+        facts: name of the JSON file.
         picture: the file without which a record is damaged, a PNG or JPEG.
         most: records kept at once.
         too_many: the error that says so.
     """
 
     def __init__(
-        self, root: Path, kind: type[Record], what: str, picture: str, most: int, too_many: Callable[[int], OsfError]
+        self,
+        root: Path,
+        kind: type[Record],
+        what: str,
+        facts: str,
+        picture: str,
+        most: int,
+        too_many: Callable[[int], OsfError],
     ) -> None:
-        self._root, self._kind, self._what, self._picture = root, kind, what, picture
+        self._root, self._kind, self._what, self._facts, self._picture = root, kind, what, facts, picture
         self._most, self._too_many = most, too_many
-        self._facts = f"{what}.json"
         self._lock = threading.RLock()
         self._known: dict[Path, tuple[object, Record | Damaged]] = {}  # with what the files were when they were read
 
@@ -131,15 +138,30 @@ class RecordFolders(Generic[Record]):
         with self._lock, self._stored():
             remove_folder(self._folder(name))
 
-    def _keep(self, record: Record, files: Files) -> None:
-        """Put a new record in place, whole or not at all."""
+    def check_room(self) -> None:
+        """Refuse a new record, damaged ones counted, if there are too many."""
+        if len(self._found()) >= self._most:
+            raise self._too_many(self._most)
+
+    def _keep(self, record: Record, files: Files, made: Path | None = None) -> Record:
+        """Put a new record in place, whole or not at all, and return it with its number.
+
+        Args:
+            record: its facts.
+            files: of it, by name.
+            made: a folder beside its place with more files, which becomes the record's; None for none.
+        """
         with self._lock, self._stored():  # others may come in at the same time
-            found = self._found()
-            if len(found) >= self._most:
-                raise self._too_many(self._most)
-            latest = max((each.number for each in found if not isinstance(each, Damaged)), default=0)
-            with folder_at_once(self._root / record.id) as folder:
-                self._write(folder, replace(record, number=latest + 1), files)
+            self.check_room()
+            latest = max((each.number for each in self._found() if not isinstance(each, Damaged)), default=0)
+            record = replace(record, number=latest + 1)
+            if made is None:
+                with folder_at_once(self._root / record.id) as folder:
+                    self._write(folder, record, files)
+            else:
+                self._write(made, record, files)
+                put_in_place(made, self._root / record.id)
+        return record
 
     def _replace(self, record: Record, files: Files) -> None:
         """Give a record that exists other files and facts, the facts last; files that are None are removed."""
@@ -347,7 +369,7 @@ class GoalStore(RecordFolders[GoalRecord]):
     """
 
     def __init__(self, root: Path, max_goals: int) -> None:
-        super().__init__(root, GoalRecord, "goal", IMAGE, max_goals, TooManyGoals)
+        super().__init__(root, GoalRecord, "goal", "goal.json", IMAGE, max_goals, TooManyGoals)
 
     def image(self, goal: str) -> Path:
         """Return where the image of a goal that exists is."""
@@ -489,7 +511,7 @@ class TablePhotoStore(RecordFolders[TablePhoto]):
     """
 
     def __init__(self, root: Path, max_photos: int) -> None:
-        super().__init__(root, TablePhoto, "photo", PICTURE, max_photos, TooManyPhotos)
+        super().__init__(root, TablePhoto, "photo", "photo.json", PICTURE, max_photos, TooManyPhotos)
 
     def picture(self, photo: str) -> Path:
         """Return where what is shown is of a photograph that exists."""

@@ -227,17 +227,17 @@ class SceneNodes:
 
         async def drag(event: viser.TransformControlsEvent) -> None:
             light = light_toward(np.asarray(event.target.position))
-            if event.phase != "end":
-                self._is_light_held = True
-                if light is not None:
-                    self._place_light(light.position)
-                    self._draw_shadows()
-                    self._on_change()
-                return
-            self._is_light_held = False
-            if light is not None:
+            is_over = event.phase == "end"
+            with self._lock:  # another thread may be placing what the scene says
+                self._is_light_held = not is_over
+                if light is None:
+                    return
                 self._place_light(light.position)
-                event.target.position = tuple(AT * light.position)
+                self._draw_shadows()
+                if is_over:
+                    event.target.position = tuple(AT * light.position)
+            self._on_change()
+            if is_over:
                 on_light(light, event.client)
 
         gizmo.on_update(drag)

@@ -5,12 +5,14 @@ import shutil
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from starlette.requests import ClientDisconnect
 
 from app.services.image_sets import Examined, ImageSets, TooManySets, examine
 from app.storage.uploads import Examiner, UploadRefused
 from osfcore.errors import CorruptFile, UnknownName
+from osfcore.io.image_file import write_png
 from tests.support.ellipsoid_sets import edit, write_set
 
 
@@ -126,6 +128,7 @@ def test_there_is_an_end_to_what_is_kept(sets, archive):
 def test_uploads_at_the_same_time_do_not_overrun_the_limit(sets, archive, tmp_path, monkeypatch):
     async def examine_at_once(_examiner, folder):
         (folder / "set.zip").unlink()
+        write_png(folder / "overlay.png", np.zeros((4, 4, 3), np.uint8))
         return Examined(1, 1, "a set")
 
     monkeypatch.setattr(Examiner, "examine", examine_at_once)
@@ -166,8 +169,11 @@ def test_a_set_whose_facts_are_damaged_does_not_hide_the_others(sets, archive, t
         folder.mkdir()
         (folder / "set.json").write_text('{"a":' * 100_000 if facts is None else json.dumps(facts))
     assert sets.all() == (record,)
-    with pytest.raises(UnknownName):
+    assert {damaged.id for damaged in sets.damaged()} == {"odd", "deep"}
+    with pytest.raises(CorruptFile):
         sets.get("odd")
+    sets.remove("odd")
+    assert {damaged.id for damaged in sets.damaged()} == {"deep"}
 
 
 def test_an_upload_that_breaks_off_leaves_nothing(sets, archive, tmp_path):
