@@ -7,6 +7,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -44,16 +45,18 @@ def test_make_targets_exist():
 
 
 @pytest.mark.slow
-def test_commands_run(data_dir, tmp_path):
+def test_commands_run(data_dir, tmp_path, record_property):
     commands = [line for block in blocks("sh") for line in block.splitlines() if line.startswith(("osf ", "echo "))]
     assert len(commands) >= 7
     box = trimesh.creation.box((0.08, 0.05, 0.03))
     box.export(tmp_path / "mesh.obj")
     for command in commands:
         environment = {**os.environ, "OSF_DATA_DIR": str(data_dir), "PATH": f"{OSF.parent}:{os.environ['PATH']}"}
+        began = time.monotonic()
         done = subprocess.run(
             ["sh", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
         )
+        record_property(command, f"{time.monotonic() - began:.1f} s")  # what a run in CI spends them on
         assert done.returncode == 0, f"{command}: {done.stderr[-500:]}"
     assert json.loads((tmp_path / "table.json").read_text())["psnr"] > 20
     for name in ("mustard", "gelatin"):
