@@ -6,6 +6,7 @@ import errno
 import ipaddress
 import logging
 import os
+import resource
 import secrets
 import signal
 import socket
@@ -34,11 +35,21 @@ if TYPE_CHECKING:
 _BACKLOG = 128
 _MAX_FRAME_BYTES = 1 << 16  # from a browser to the 3D view
 _GRACE_S = 2  # for open requests after Ctrl-C
+_ADDRESSES_GB = 3.0  # of a process: its threads alone reserve 1.9 on two cores
+_MEMORY_GB = 1.5  # of all processes: 0.9 at rest, 1.4 while an episode runs
+_MEMORY_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 FILE_BYTES, FILES = 2_000_000, 5  # of the log: the newest is service.log, the older ones end in .1 to .4
 
 
 class CannotListen(OsfError):
     """The address cannot be served."""
+
+
+class LittleMemory(OsfError):
+    """The service would not run in the memory that there is."""
+
+    def __init__(self, has: str, needed_gb: float) -> None:
+        super().__init__(f"There is too little memory for the service: {has}, and it needs {needed_gb:g} GB.")
 
 
 @dataclass(frozen=True)
@@ -58,6 +69,7 @@ class Serve(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Serve until interrupted."""
+        check_memory()
         need("serve", "This command")
         from app.storage.database import check_data_dir
 
@@ -74,6 +86,21 @@ class Serve(DataCommand):
             signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
             server.run(sockets=[listener])
         return {"url": url}
+
+
+def check_memory() -> None:
+    """Refuse to begin what would end in the middle of a start, or answer nobody.
+
+    Raises:
+        LittleMemory: if each process, or all of them together, may have less memory than they need.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < _ADDRESSES_GB * 1e9:
+        raise LittleMemory(f"ulimit -v lets each process have {limit / 1e9:.1f} GB", _ADDRESSES_GB)
+    for path in _MEMORY_LIMITS:
+        with suppress(OSError, ValueError):  # no such file, or "max"
+            if (limit := int(path.read_text())) < _MEMORY_GB * 1e9:
+                raise LittleMemory(f"this container may have {limit / 1e9:.1f} GB", _MEMORY_GB)
 
 
 def bound_socket(host: str, port: int) -> socket.socket:

@@ -306,3 +306,12 @@ def test_a_target_that_is_not_empty_is_one_sentence(tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.startswith("osf: ")
     assert "move this one away" in error
+
+
+def test_too_little_memory_is_one_sentence_before_anything_begins(tmp_path):
+    command = f"ulimit -v 1500000; exec {sys.executable} -m app.cli serve --port 0 --data-dir {tmp_path / 'data'}"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "memory" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "data").exists()
