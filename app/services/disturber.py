@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from app.processes.disturbances import Disturbance
 from app.processes.messages.scene_messages import Disturb, EditScene, SceneRecord
+from app.processes.sim_process import Disturbance
 from app.services.scenes import Scenes
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects
 from osfcore.geometry.cameras import default_cameras

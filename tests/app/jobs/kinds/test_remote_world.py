@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.jobs.kinds.remote_world import RemoteWorld
+from app.jobs.kinds.episodes import RemoteWorld
 from app.processes.messages.scene_messages import Act, ObservedScene, ObserveScene, SceneRecord, TakeView
 from osfcore.errors import InvalidInput, NotThere, OsfError
 from osfcore.geometry.cameras import default_cameras, goal_camera
