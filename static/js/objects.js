@@ -5,7 +5,6 @@ import { doubted } from "./doubt.js";
 import { prepareTraining } from "./fields.js";
 import { showJob } from "./jobs.js";
 import { makeScene } from "./scenes.js";
-import { closeStory } from "./story.js";
 import { current, known, objects, set, watch } from "./state.js";
 import { scrollTo, showTab } from "./tabs.js";
 import { act, tellFailure, toast } from "./toasts.js";
@@ -39,7 +38,6 @@ async function putOnTable(object) {
   if (there.includes(object.name)) throw new Error(`${object.label} is on the table already.`);
   if (there.length >= MOST_ON_TABLE) throw new Error(`${MOST_ON_TABLE} objects are on the table, which is the most.`);
   const light = current() ? { light: { position: current().light.position } } : {};
-  closeStory();
   await makeScene({ objects: [...there, object.name], seed: Math.floor(Math.random() * 2 ** 31), ...light });
   toast(`${object.label} is on the table, in a scene of its own; the one before is kept under Scenes.`);
 }
