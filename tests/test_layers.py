@@ -149,6 +149,14 @@ def test_web_process_starts_without_heavy_packages():
     assert done.stdout.split() == []
 
 
+def test_no_two_modules_of_the_page_import_each_other():
+    modules = {path.name: path.read_text() for path in (ROOT / "static" / "js").glob("*.js")}
+    uses = {name: set(re.findall(r'from "\./([\w-]+\.js)"', text)) for name, text in modules.items()}
+    assert any(uses.values())
+    assert set().union(*uses.values()) <= set(modules)
+    TopologicalSorter(uses).prepare()  # raises an error that names the modules of a circle
+
+
 def test_the_page_asks_nobody_else():
     for path in (ROOT / "static").rglob("*"):
         if path.suffix in {".html", ".js", ".css"} and "vendor" not in path.parts:

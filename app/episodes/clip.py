@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from app.episodes.file_names import GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
-from app.episodes.trajectory import LookFrame, Moment, PlanSketch, ReplayClock, Trajectory, read_trajectory
+from app.episodes.trajectory import LookFrame, Moment, ReplayClock, Trajectory, read_trajectory
 from osfcore.errors import CannotWrite, OsfError
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
@@ -26,6 +26,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.io.files import as_mapping, file_at_once, read_json, reading_png
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.planning.mppi import PlanSketch
 from osfcore.world.imaging import RayTracer, TracedMesh
 
 WIDTH, HEIGHT = 1920, 1080

@@ -12,7 +12,6 @@ from functools import partial
 
 import viser
 
-from app.episodes.trajectory import PlanSketch
 from app.jobs.job import Job, JobChanged, JobView
 from app.processes.messages.scene_messages import SceneChanged
 from app.services import episodes, estimates
@@ -26,6 +25,7 @@ from osfcore.control.events import GoalFound, Looking, Stepped
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.states import EstimatedState
 from osfcore.planning.costs import PoseGoal
+from osfcore.planning.mppi import PlanSketch
 
 ESTIMATE_INTERVAL_S, EPISODE_INTERVAL_S = 0.1, 0.08  # least time between two drawings
 _PARTS: tuple[tuple[Part, str, str], ...] = (

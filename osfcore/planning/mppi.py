@@ -38,6 +38,7 @@ COMPARED = 3  # sequences that are rolled out once more after the second round, 
 _FINALISTS = 24  # sequences of the first round that are rolled out from other begins
 _BEGINS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 _RANDOM_WALK_M = 0.06  # standard deviation of random walks at their knots
+WAYS = 24  # of the pusher that a sketch keeps
 
 Rollout = Callable[[SceneState, Float[np.ndarray, "K T 3"], SceneState | None], Rollouts]
 
@@ -138,6 +139,31 @@ class PlanRound:
     def best(self) -> Rollouts:
         """The future of the chosen sequence, K = 1; the plan's own lies close to it."""
         return self.rollouts[int(self.costs.argmin()) if self.chosen is None else self.chosen]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlanSketch:
+    """A round of planning, as much of it as a picture shows.
+
+    Attributes:
+        step: actions executed so far.
+        ways: where the pusher would go, cheapest first [m].
+        costs: theirs, ascending.
+        best: the cheapest future, K = 1.
+    """
+
+    step: int
+    ways: Float[np.ndarray, "W T1 2"]
+    costs: Float[np.ndarray, "W"]
+    best: Rollouts
+
+
+def sketch_of(step: int, round_: PlanRound) -> PlanSketch:
+    """Return the best future, and ways spread evenly from the cheapest to the dearest."""
+    order = np.argsort(round_.costs, kind="stable")
+    chosen = order[np.round(np.linspace(0, len(order) - 1, min(WAYS, len(order)))).astype(int)]
+    ways = round_.rollouts.pusher[chosen, :, :2].astype(np.float32)
+    return PlanSketch(step, ways, round_.costs[chosen], round_.best)
 
 
 class MPPIPlanner:

@@ -34,7 +34,6 @@ from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
-    from app.episodes.trajectory import PlanSketch
     from app.jobs.context import JobContext
     from osfcore.control.estimators import SceneModels
     from osfcore.control.events import EpisodeSettings, Event
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
     from osfcore.control.prepared import PreparedLooks
     from osfcore.control.world import World
     from osfcore.planning.costs import PoseGoal
+    from osfcore.planning.mppi import PlanSketch
 
 _STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not have to move
 
@@ -173,8 +173,8 @@ class _Published:
 
 def _drawn(event: Event) -> Event | PlanSketch | None:
     """Return what a picture shows of an event."""
-    from app.episodes.trajectory import sketch_of
     from osfcore.control.events import Observed, Planning
+    from osfcore.planning.mppi import sketch_of
 
     match event:
         case Observed():  # its images are on the page already

@@ -10,13 +10,13 @@ import numpy as np
 import viser
 from jaxtyping import Float, UInt8
 
-from app.episodes.trajectory import PlanSketch
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of
 from app.viewer.nodes.room import NO_LINES, Colour, Label, Target, atomic
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.planning.mppi import PlanSketch
 
 Part = Literal["goal", "plan", "estimate"]
 PARTS: tuple[Part, ...] = ("goal", "plan", "estimate")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from app.cli.main import main
 from app.episodes.file_names import FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
 from app.episodes.mcap import write_mcap
-from app.episodes.trajectory import PlanSketch, Round, Trajectory, write_trajectory
+from app.episodes.trajectory import Round, Trajectory, write_trajectory
 from osfcore.extras import MissingExtra
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.light import Light
@@ -21,6 +21,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.io.image_file import write_png
+from osfcore.planning.mppi import PlanSketch
 from tests.support.errors import about
 
 BOX = "009_gelatin_box"

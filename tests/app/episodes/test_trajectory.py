@@ -7,7 +7,6 @@ from app.episodes.trajectory import (
     PLAN_S,
     REST_S,
     LookFrame,
-    PlanSketch,
     ReplayClock,
     Round,
     Trajectory,
@@ -23,6 +22,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.geometry.workspace import STEP_S
+from osfcore.planning.mppi import PlanSketch
 from osfcore.progress import Progress
 
 NAMES = ("mug", "can")

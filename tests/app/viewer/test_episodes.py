@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.episodes.trajectory import PlanSketch
 from app.jobs.job import Job, JobChanged, JobView, State
 from app.processes.messages.scene_messages import SceneChanged
 from app.services.event_hub import CurrentScene
@@ -26,6 +25,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.planning.costs import PoseGoal
+from osfcore.planning.mppi import PlanSketch
 from osfcore.progress import Progress
 from tests.app.conftest import until
 from tests.app.storage.test_database import record

@@ -15,7 +15,6 @@ from app.episodes.file_names import (
     TRAJECTORY_FILE,
     VIDEO_FILE,
 )
-from app.episodes.trajectory import PlanSketch
 from app.jobs.context import JobContext, JobControl, RunJob
 from app.jobs.job import INPUTS
 from app.jobs.kinds import KINDS
@@ -31,6 +30,7 @@ from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.scene_file import camera_to_json
 from osfcore.paper import stages
 from osfcore.paper.estimation import PaperEstimationConfig, estimate_first
+from osfcore.planning.mppi import PlanSketch
 from osfcore.progress import Progress
 from tests.app.jobs.kinds.test_remote_world import NAMES, Stage, stage  # noqa: F401  a fixture
 from tests.support.tabletop_scenes import perfect_fit, sure

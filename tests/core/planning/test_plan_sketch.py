@@ -2,9 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.episodes.trajectory import WAYS, sketch_of
 from osfcore.geometry.rollouts import Rollouts
-from osfcore.planning.mppi import PlanRound
+from osfcore.planning.mppi import WAYS, PlanRound, sketch_of
 
 
 def planned(costs, horizon=3):
