@@ -99,12 +99,12 @@ def test_everything_is_there_after_a_restart(open_runner):
     moved = runner.scenes.act(first.id, [(0.1, 0.1, 0.0)] * 2)
     runner.scenes.activate(first.id)
     again = open_runner()
-    assert again.current == first.id
-    assert [record.seed for record in again.scenes()] == [3, 4]
-    found = again.scene(first.id)
+    assert again.scenes.current == first.id
+    assert [record.seed for record in again.scenes.all()] == [3, 4]
+    found = again.scenes.get(first.id)
     assert found.time_s == moved.time_s
     assert np.array_equal(found.state.poses.position, moved.state.poses.position)
-    back = again.reset_scene(first.id)
+    back = again.scenes.reset(first.id)
     assert np.allclose(back.state.poses.position, first.state.poses.position, atol=1e-9)
 
 
@@ -336,7 +336,7 @@ def test_a_push_that_cannot_be_stored_has_happened_and_is_stored_later(open_runn
     assert runner.scenes.get(scene.id).time_s == moved.time_s
     until(lambda: runner.unwritten == 0)
     again = open_runner(demo_scene=False)
-    assert again.scene(scene.id).time_s == moved.time_s
+    assert again.scenes.get(scene.id).time_s == moved.time_s
 
 
 @pytest.mark.slow
@@ -365,7 +365,7 @@ def test_what_a_hand_moves_on_a_full_disk_is_refused_and_undone(open_runner):
         assert seen() == before
         assert runner.unwritten == 0
     again = runner.scenes.edit(made.id, light=Light(np.array([0.5, 0.0, 1.5])))
-    assert open_runner(demo_scene=False).scene(made.id).revision == again.revision
+    assert open_runner(demo_scene=False).scenes.get(made.id).revision == again.revision
 
 
 @pytest.mark.slow
