@@ -70,7 +70,7 @@ def test_while_slow_requests_wait_health_answers_and_work_can_be_ended(live, mon
     """A hundred pushes of a simulation that hangs: far more than there are threads."""
     free, runner = threading.Event(), live.services.runner
     _, scene = live.request("POST", "/api/scenes", {"seed": 1, "count": 1})
-    monkeypatch.setattr(runner, "act", lambda *_: free.wait(60) and runner.scenes.get(scene["id"]))
+    monkeypatch.setattr(runner.scenes, "act", lambda *_: free.wait(60) and runner.scenes.get(scene["id"]))
     push = f"/api/scenes/{scene['id']}/actions"
     with ThreadPoolExecutor(100) as pushers:
         pushes = [pushers.submit(live.request, "POST", push, {"actions": [[0.1, 0, 0]]}) for _ in range(100)]

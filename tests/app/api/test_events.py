@@ -107,7 +107,7 @@ def test_nonsense_as_last_number_is_no_matter(live, last):
 def test_live_images_come_only_where_asked_for(live, shown, monkeypatch):
     runner, changes = live.services.runner, []
     watch_frames = runner.scenes.watch_frames
-    monkeypatch.setattr(runner, "watch_frames", lambda change: (changes.append(change), watch_frames(change)))
+    monkeypatch.setattr(runner.scenes, "watch_frames", lambda change: (changes.append(change), watch_frames(change)))
     with Stream(live, "?frames=1") as stream:
         _, _, frame = stream.next("frame")
         assert frame["scene"] == shown["id"]

@@ -196,7 +196,7 @@ def test_an_image_of_a_scene_deleted_meanwhile_is_not_found(service, services, s
         services.runner.delete_scene(command.id)
         raise UnknownName("scene", "a", [])
 
-    monkeypatch.setattr(services.runner, "image", gone)
+    monkeypatch.setattr(services.runner.scenes, "image", gone)
     is_problem(service.get(f"/api/scenes/{scene['id']}/images/0.png"), 404)
 
 
