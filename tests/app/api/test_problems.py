@@ -13,7 +13,7 @@ from app.storage.uploads import UploadNotStored, UploadRefused
 from osfcore.errors import InvalidInput, MissingAssets, NotThere, OsfError, OverlappingObjects, WorkerDied
 
 # What no request meets
-OF_PROGRAMS = {"CannotListen", "DataDirectoryInUse", "NoEpisode", "NothingPushed", "ServiceError"}
+OF_PROGRAMS = {"CannotListen", "DataDirectoryInUse", "LittleMemory", "NoEpisode", "NothingPushed", "ServiceError"}
 
 
 def kinds_of(base):
