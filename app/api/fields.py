@@ -99,7 +99,7 @@ def list_sets(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEn
     """List the uploaded image sets, oldest first."""
     sets = services.runner.sets
     shown, total, following = page(sets.all()[::-1], limit, after, newest_first=False)
-    damaged = [DamagedOut(id=each.id, reason=each.reason) for each in sets.damaged()]
+    damaged = DamagedOut.of(sets.damaged())
     return SetList(sets=[SetOut.of(record) for record in shown], damaged=damaged, total=total, next=following)
 
 

@@ -246,7 +246,7 @@ async def create(
 def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> GoalList:
     """List goals, newest first."""
     shown, total, following = page(services.goals.all(), limit, after, newest_first=True)
-    damaged = [DamagedOut(id=each.id, reason=each.reason) for each in services.goals.damaged()]
+    damaged = DamagedOut.of(services.goals.damaged())
     return GoalList(goals=[GoalOut.of(record) for record in shown], damaged=damaged, total=total, next=following)
 
 

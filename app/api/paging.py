@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Protocol, TypeVar
 
 from fastapi import Query
 from pydantic import BaseModel, Field
+
+from app.storage.records import Damaged
 
 DEFAULT_PAGE = 100
 _AFTER = "The `next` of the page before; the list begins with its first entry if left out."
@@ -20,6 +22,11 @@ class DamagedOut(BaseModel):
 
     id: str
     reason: str = Field(description="What is wrong with it.")
+
+    @staticmethod
+    def of(damaged: Iterable[Damaged]) -> list[DamagedOut]:
+        """Return what a store has found damaged."""
+        return [DamagedOut(id=each.id, reason=each.reason) for each in damaged]
 
 
 class JobPageOut(BaseModel):

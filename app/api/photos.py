@@ -364,7 +364,7 @@ async def create(
 def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEntry = None) -> PhotoList:
     """List photos of tables, newest first."""
     shown, total, following = page(services.photos.all(), limit, after, newest_first=True)
-    damaged = [DamagedOut(id=each.id, reason=each.reason) for each in services.photos.damaged()]
+    damaged = DamagedOut.of(services.photos.damaged())
     return PhotoList(photos=[facts_of(photo) for photo in shown], damaged=damaged, total=total, next=following)
 
 

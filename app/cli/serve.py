@@ -36,7 +36,7 @@ _BACKLOG = 128
 _MAX_FRAME_BYTES = 1 << 16  # from a browser to the 3D view
 _GRACE_S = 2  # for open requests after Ctrl-C
 _ADDRESSES_GB = 3.0  # of a process: its threads alone reserve 1.9 on two cores
-_MEMORY_GB = 1.5  # of all processes: 0.9 at rest, 1.4 while an episode runs
+_MEMORY_GB = 1.0  # of all processes, which share 0.65 at rest and 0.9 while an episode of one object runs (sums of Pss)
 _MEMORY_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 FILE_BYTES, FILES = 2_000_000, 5  # of the log: the newest is service.log, the older ones end in .1 to .4
 

@@ -47,7 +47,7 @@ _STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not ha
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class EpisodeStep(EpisodeProgress):
+class EpisodeJobProgress(EpisodeProgress):
     """How far an episode is; nothing of how long acting takes is known before it begins.
 
     Attributes:
@@ -79,7 +79,7 @@ class EpisodeStep(EpisodeProgress):
         return self.view is not None and not isinstance(self.view, Looking)
 
 
-def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeStep]:
+def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeJobProgress]:
     """Run an episode.
 
     Raises:
@@ -98,7 +98,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeSt
     use_one_thread()
     chosen, names = ChosenSettings.of_job(params), tuple(params["names"])
     settings, method = chosen.of_loop(), chosen.method
-    yield EpisodeStep(0, 0, "Loading fields, half a minute the first time")
+    yield EpisodeJobProgress(0, 0, "Loading fields, half a minute the first time")
     models = _models(method, names, place)
     world = RemoteWorld(place.orders.ask, params["scene"])
     goal, start = params["goal"], world.truth()
@@ -113,7 +113,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeSt
         loop = Episode(world, models, wanted, settings, rng, prepared=prepared)
     else:
         loop = _Published(world, models, image, settings, rng)
-    progress, timer = EpisodeStep(0, 0, "Looking"), TimeLeft(finds_goal=image is None)
+    progress, timer = EpisodeJobProgress(0, 0, "Looking"), TimeLeft(finds_goal=image is None)
     pictures = LookPictures(models.appearance.together, wanted)
     with contextlib.closing(record):
         for event in recorded(loop.run(), record):

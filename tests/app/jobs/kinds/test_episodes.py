@@ -18,7 +18,7 @@ from app.episodes.file_names import (
 from app.jobs.context import JobContext, JobControl, RunJob
 from app.jobs.job import INPUTS
 from app.jobs.kinds import KINDS
-from app.jobs.kinds.episodes import EpisodeStep, episode_job
+from app.jobs.kinds.episodes import EpisodeJobProgress, episode_job
 from app.jobs.worker import run_job
 from osfcore.control import estimators
 from osfcore.control.events import ActionExecuted, Looking, Observed, Planning, Stepped
@@ -93,7 +93,7 @@ def report_of(place):
 def test_an_episode_pushes_what_is_on_the_scene_and_leaves_its_files(place, stage, sighted):  # noqa: F811
     before = stage.world.truth()
     *steps, last = list(episode_job(params(stage), place))
-    assert all(isinstance(step, EpisodeStep) for step in steps)
+    assert all(isinstance(step, EpisodeJobProgress) for step in steps)
     assert [step.view.number for step in steps if isinstance(step.view, ActionExecuted)] == [1, 2, 3]
     assert sum(step.ends_round for step in steps) == 4
     assert stage.world.time_s == pytest.approx(0.6)
@@ -127,7 +127,7 @@ def test_what_a_view_must_not_miss_says_so(place, stage, sighted):  # noqa: F811
 
 def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
     told = []
-    steps = [EpisodeStep(1, 2, "Pushing", share=0.5, left_s=9.0, stage="act", steps=1, seconds=31.0)]
+    steps = [EpisodeJobProgress(1, 2, "Pushing", share=0.5, left_s=9.0, stage="act", steps=1, seconds=31.0)]
     monkeypatch.setitem(
         KINDS, "episode", replace(KINDS["episode"], run=lambda _params, _place: (step for step in steps))
     )
@@ -228,10 +228,10 @@ def test_rounds_end_where_a_step_of_the_loop_does():
     state = sure(SceneState((), Pose(np.zeros((0, 3)), np.zeros((0, 4))), Light(np.array([0.0, 0, 1])), None))
     image = np.zeros((16, 16, 3))
     stepped = Stepped(1, 3, state, np.zeros(0), np.zeros(0), 0.0, image, {})
-    assert EpisodeStep(1, 3, "Looking", view=stepped).ends_round
-    assert not EpisodeStep(1, 3, "Pushing", view=ActionExecuted(1, np.zeros(3))).ends_round
-    assert not EpisodeStep(0, 3, "Loading").ends_round
-    assert not EpisodeStep(0, 3, "Loading").must_be_told
+    assert EpisodeJobProgress(1, 3, "Looking", view=stepped).ends_round
+    assert not EpisodeJobProgress(1, 3, "Pushing", view=ActionExecuted(1, np.zeros(3))).ends_round
+    assert not EpisodeJobProgress(0, 3, "Loading").ends_round
+    assert not EpisodeJobProgress(0, 3, "Loading").must_be_told
 
 
 # The method as published
