@@ -18,6 +18,10 @@ from tests.kernels import compile_kernels
 
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as the command line does, before torch comes in
 os.environ.setdefault("OSF_STANDBY", "0")  # a process in reserve would take time from tests that need none
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # each process has its share of the cores: more threads would only wait
+    _THREADS = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
+    for _name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(_name, str(_THREADS))
 # A shell lets what it runs in the background ignore Ctrl-C; commands that tests interrupt would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 # Timing lives in benchmarks: a busy machine is no failure.
