@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from osfcore.estimation.objective import (
     QUALITY,
@@ -347,14 +348,15 @@ def _non_maximum_suppression(poses: Pose, scores: np.ndarray, most: int) -> Temp
     """Keep the best ones that differ in place or orientation."""
     order = np.argsort(-scores)
     poses, scores = poses[order], scores[order]
-    positions, quaternions = poses.position, poses.quaternion
-    kept, left = [], np.ones(len(scores), bool)
-    while left.any() and len(kept) < most:
-        k = int(left.argmax())
-        kept.append(k)
-        near = np.linalg.norm(positions - positions[k], axis=1) <= _NEAR_M
-        left &= ~(near & (np.abs(quaternions @ quaternions[k]) >= np.cos(_NEAR_RAD / 2)))
-        left[k] = False
+    tree, kept, left = KDTree(poses.position), [], np.ones(len(scores), bool)
+    for k in range(len(scores)):
+        if len(kept) == most:
+            break
+        if left[k]:
+            kept.append(k)
+            near = np.array(tree.query_ball_point(poses.position[k], _NEAR_M))
+            alike = np.abs(poses.quaternion[near] @ poses.quaternion[k]) >= np.cos(_NEAR_RAD / 2)
+            left[near[alike]] = False
     return TemplateMatches(poses[kept], scores[kept])
 
 

@@ -263,12 +263,13 @@ def poses_from_mask(loss: PoseLoss, quaternions: Float[np.ndarray, "K 4"]) -> Po
     depth = K[0, 0] * loss.surfels.radius / np.sqrt(area / np.pi)
     local = np.tile(ray * depth, (len(quaternions), 1))
     camera = window.T_camera_world.inverse()
-    rows, columns = np.mgrid[: window.size[0], : window.size[1]] + 0.5
+    rows, columns = (np.arange(side) + 0.5 for side in window.size)
     for _ in range(_CENTRING_ROUNDS):
         index, _ = draw(loss.surfels, window, Pose(camera.apply(local), quaternions))
         shown = index >= 0
-        found = np.maximum(shown.sum(axis=(1, 2)), 1)
-        x, y = (shown * columns).sum(axis=(1, 2)) / found, (shown * rows).sum(axis=(1, 2)) / found
+        per_row, per_column = shown.sum(axis=2), shown.sum(axis=1)
+        found = np.maximum(per_row.sum(axis=1), 1)
+        x, y = per_column @ columns / found, per_row @ rows / found
         shift = (centroid - np.stack([x, y], axis=1)) / K[[0, 1], [0, 1]] * local[:, 2:]
         share = np.clip(np.sqrt(found / area), _MOST_CHANGE, 1 / _MOST_CHANGE)
         shift[found <= 1] = 0
