@@ -15,26 +15,15 @@ from app.api.bodies import FORGOTTEN, PNG, BoundedRoute, Forget, OpenFile, binar
 from app.api.dependencies import Services, ServicesDep, slow, urgent
 from app.api.events import SEEN, LastEventId, StreamDep, followed, unended
 from app.api.jobs import JobOut, ProgressOut, progress_of
-from app.api.models import (
-    HORIZON,
-    SAMPLES,
-    STEPS,
-    DisplayName,
-    Horizon,
-    Identifier,
-    Input,
-    Poses,
-    Samples,
-    SceneRef,
-    Seed,
-    Steps,
-)
+from app.api.models import HORIZON, SAMPLES, STEPS, DisplayName, Horizon, Input, Poses, Samples, SceneRef, Steps
 from app.api.paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
 from app.api.problems import named_in_path, problems
 from app.episodes.file_names import REPORT_FILE
 from app.episodes.frames import Part
 from app.episodes.settings import ChosenSettings
 from app.jobs.job import Job
+from app.jobs.kinds.episodes import EpisodeParams
+from app.jobs.params import Identifier, Seed
 from osfcore.control.events import CostKind, EpisodeSettings, Matter
 from osfcore.errors import CorruptFile
 from osfcore.paper.method import METHODS, Method
@@ -195,27 +184,24 @@ class EpisodeOut(ProgressOut):
     files: list[str] = Field(description="Names to download from /api/episodes/{id}/files/{name}.")
 
     @staticmethod
-    def of_job(
-        job: Job, name: str, settings: ChosenSettings, report: dict[str, Any] | None, files: tuple[str, ...]
-    ) -> EpisodeOut:
+    def of_job(job: Job, name: str, report: dict[str, Any] | None, files: tuple[str, ...]) -> EpisodeOut:
         """From the registry's job and what it has written so far.
 
         Args:
             job: of the kind "episode".
             name: for people.
-            settings: as they are now.
             report: what report.json holds; None before there is one, or where steps are not asked for.
             files: names that can be downloaded.
         """
-        report, result = report or {}, job.result or {}
+        report, result, params = report or {}, job.result or {}, EpisodeParams.from_json(job.params)
         return EpisodeOut(
             **progress_of(job),
             name=name,
-            scene=job.params["scene"],
-            goal=job.params["goal"]["id"],
-            objects=job.params["names"],
-            seed=job.params["seed"],
-            settings=settings,
+            scene=params.scene,
+            goal=params.goal.id,
+            objects=list(params.names),
+            seed=params.seed,
+            settings=params.settings,
             done=job.done,
             total=job.total,
             stage=result.get("stage"),
@@ -282,10 +268,7 @@ def list_all(
 ) -> EpisodeList:
     """List episodes, newest first, without their steps."""
     episodes, page = services.episodes, services.episodes.page(limit, after, search, outcome)
-    listed = [
-        EpisodeOut.of_job(job, episodes.name(job), episodes.settings(job), None, episodes.files(job))
-        for job in page.jobs
-    ]
+    listed = [EpisodeOut.of_job(job, episodes.name(job), None, episodes.files(job)) for job in page.jobs]
     return EpisodeList(episodes=listed, total=page.total, next=page.next)
 
 
@@ -404,9 +387,9 @@ def file(
 
 def _out(services: Services, job: Job) -> EpisodeOut:
     episodes = services.episodes
-    settings, files, report = episodes.settings(job), episodes.files(job), episodes.report(job)
+    files, report = episodes.files(job), episodes.report(job)
     try:
-        return EpisodeOut.of_job(job, episodes.name(job), settings, report, files)
+        return EpisodeOut.of_job(job, episodes.name(job), report, files)
     except (ValidationError, TypeError) as error:
         if report is None:
             raise

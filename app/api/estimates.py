@@ -14,12 +14,13 @@ from app.api.bodies import BINARY, FORGOTTEN, JSON, SMALL_BODY_BYTES, Forget, Op
 from app.api.dependencies import ServicesDep, urgent
 from app.api.events import SEEN, LastEventId, StreamDep, followed, unended
 from app.api.jobs import ProgressOut, progress_of
-from app.api.models import FileName, Identifier, Input, Seed
+from app.api.models import FileName, Input
 from app.api.paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
 from app.api.problems import named_in_path, problems
 from app.api.scenes import COMPARED, compared, compared_png
 from app.jobs.job import Job
-from app.jobs.kinds.estimates import Mode
+from app.jobs.kinds.estimates import EstimateParams, Mode
+from app.jobs.params import Identifier, Seed
 from app.services.estimates import Asked, Estimates
 from osfcore.errors import OsfError
 from osfcore.io.scene_file import EstimateJson
@@ -113,14 +114,15 @@ class EstimateOut(ProgressOut):
             estimate: the result; None before it is there, or where it is not asked for.
             errors: against the truth, as from `errors_of`; None where nobody knows it.
         """
+        params = EstimateParams.from_json(job.params)
         return EstimateOut(
             **progress_of(job),
-            mode=job.params["mode"],
-            method=job.params.get("method", "ours"),
-            seed=job.params["seed"],
-            of=ObservedOut(**job.params["of"]),
-            objects=job.params["names"],
-            cameras=job.params["cameras"],
+            mode=params.mode,
+            method=params.method,
+            seed=params.seed,
+            of=ObservedOut(**dict(params.of)),
+            objects=list(params.names),
+            cameras=list(params.cameras),
             done=job.done,
             total=job.total,
             stage=steps[-1]["stage"] if steps else None,

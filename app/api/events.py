@@ -170,7 +170,7 @@ class Mailbox:
                 self.is_scene_new, self.frames, self.look = True, None, None
             case SceneChanged(record):
                 self.is_scene_new = self.is_scene_new or record.id == self._current
-            case JobView(job, Looking() as look) if job.params.get("scene") in (None, self._current):
+            case JobView(job, Looking() as look) if job.scene in (None, self._current):
                 self.look = look
             case FramesTaken():
                 self.frames = event if event.scene == self._current else self.frames

@@ -9,9 +9,11 @@ from pydantic import BaseModel, Field
 
 from app.api.bodies import PNG, OpenFile, upload
 from app.api.dependencies import Services, ServicesDep
-from app.api.models import FileName, Identifier, Input
+from app.api.models import FileName, Input
 from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
 from app.api.problems import named_in_path, problems
+from app.jobs.kinds.fields import TrainFieldParams
+from app.jobs.params import Identifier
 from app.services.fields import NoTrainedField
 from app.services.image_sets import SetRecord
 from osfcore.fields.field_library import FieldInfo
@@ -137,8 +139,9 @@ def use(services: ServicesDep, name: FieldName, body: UseIn) -> FieldOut:
     """Use a field that was trained here, though it is not as good as the one that is in use."""
     _known_field(services, name)
     job = services.runner.jobs.get(body.job, "train_field")
-    is_ours = job.params.get("method", "ours") == "ours"  # one as published is in use anyway, elsewhere
-    if job.params["name"] != name or job.state != "done" or not is_ours:
+    params = TrainFieldParams.from_json(job.params)
+    is_ours = params.method == "ours"  # one as published is in use anyway, elsewhere
+    if params.name != name or job.state != "done" or not is_ours:
         raise NoTrainedField(name)
     services.fields.use(name, services.runner.jobs.folder(job.id))
     services.runner.storage.outdate()

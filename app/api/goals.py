@@ -24,10 +24,11 @@ from app.api.bodies import (
     whole_body,
 )
 from app.api.dependencies import Services, ServicesDep, slow
-from app.api.models import DisplayName, Identifier, Input, LightIn, ObjectCount, Poses, SceneRef, Seed
+from app.api.models import DisplayName, Input, LightIn, Poses, SceneRef
 from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
 from app.api.problems import NotFound, named_in_path, problems
 from app.api.scenes import SceneObject
+from app.jobs.params import Identifier, ObjectCount, Seed
 from app.services.goals import Draft, GoalCheck, GoalVerdict, NoDraft
 from app.storage.photos import PhotoCrop
 from app.storage.records import GoalRecord, Source

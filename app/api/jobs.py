@@ -5,88 +5,17 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Body, Depends, Path, Response
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field
 
 from app.api.bodies import FORGOTTEN, PNG, BoundedRoute, Forget, OpenFile, binary
 from app.api.dependencies import ServicesDep, urgent
-from app.api.models import Identifier, ImageCount, ImageSize, Input, ObjectCount, ObjectName, Seed
+from app.api.models import Input
 from app.api.paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
 from app.api.problems import named_in_path, problems
 from app.jobs.job import Job, State, check_file_name
 from app.jobs.kinds import KindName
-from app.jobs.kinds.fields import COMPARISON, PREVIEW
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
-from osfcore.paper.method import Method
-
-
-class CollectPushesParams(Input):
-    """Episodes of random pushes for learning dynamics, as one HDF5 file."""
-
-    episodes: int = Field(1000, ge=1, le=100_000)
-    steps: int = Field(50, ge=1, le=1000, description="Actions of 0.2 s an episode.")
-    objects: ObjectCount = Field(3, description="Objects a scene, drawn at random.")
-    policy: Literal["paper", "directed"] = Field(
-        "paper", description="Uniform random velocities, or a pusher that seeks sustained contact."
-    )
-    seed: Seed = 0
-    images: bool = Field(False, description="Keep frames of camera 0 as well.")
-
-
-class CollectTableParams(Input):
-    """Images of the bare table under many lights."""
-
-    images: ImageCount = 300
-    size: ImageSize = DEFAULT_IMAGE_SIDE
-    seed: Seed = 0
-
-
-class CollectObjectParams(CollectTableParams):
-    """Images of one object from all sides under many lights."""
-
-    name: ObjectName
-
-
-class FetchAssetsParams(Input):
-    """Objects to fetch from the package index."""
-
-    names: list[ObjectName] = Field(default=[], max_length=64, description="Empty for all that it has.")
-
-
-class FieldSource(Input):
-    """What to learn a field from: a mesh, of which images are then taken first, or an uploaded image set."""
-
-    mesh: ObjectName | None = Field(None, description="An object whose mesh is on this machine.")
-    set: Identifier | None = Field(None, description="Identifier of an uploaded image set.")
-
-    @model_validator(mode="after")
-    def _names_one(self) -> FieldSource:
-        if (self.mesh is None) == (self.set is None):
-            raise ValueError("give either mesh or set")
-        return self
-
-
-class TrainFieldParams(Input):
-    """A field to train. It replaces one of this name only if it is no worse on the same held-out images.
-
-    But for one as published: that takes the place of an earlier one as published, and never that of ours.
-    """
-
-    name: ObjectName = Field(description="Of the field; scenes need a mesh of the same name.")
-    source: FieldSource
-    minutes: float = Field(30, ge=0.1, le=1440, description="How long to train [min].")
-    seed: Seed = 0
-    images: ImageCount = Field(300, description="Images to take of a mesh; a set has its own.")
-    hollow: bool = Field(False, description="The object has hollows that no silhouette shows, such as a bowl's.")
-    method: Method = Field(
-        "ours",
-        description='Whose field: "ours", or "paper", a KiloOSF as published, which is kept beside ours, uncompared.',
-    )
-
-    @model_validator(mode="after")
-    def _fits(self) -> TrainFieldParams:
-        if self.method == "paper" and self.hollow:
-            raise ValueError("hollow is of our method alone; leave it out with the one as published")
-        return self
+from app.jobs.kinds.collections import CollectObjectParams, CollectPushesParams, CollectTableParams, FetchAssetsParams
+from app.jobs.kinds.fields import COMPARISON, PREVIEW, TrainFieldParams
 
 
 class CollectPushesJob(Input):
@@ -193,7 +122,7 @@ FoundDep = Annotated[Job, Depends(_known_job)]
 @router.post("", status_code=202, responses=problems(409, 429, 507))
 def create(services: ServicesDep, body: Annotated[JobIn, Body()], response: Response) -> JobOut:
     """Queue a job; one runs at a time. Outputs go to the data directory's collections/ID."""
-    job = services.runner.submit_job(body.kind, body.params.model_dump())
+    job = services.runner.submit_job(body.kind, body.params)
     response.headers["Location"] = f"/api/jobs/{job.id}"
     return JobOut.of(job)
 

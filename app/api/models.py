@@ -11,9 +11,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from app.services.scenes import MAX_SEED
+from app.jobs.params import Identifier, ObjectName
 from osfcore.control.events import MAX_STEPS
-from osfcore.geometry.cameras import MAX_IMAGE_SIDE, MIN_IMAGE_SIDE
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
@@ -23,18 +22,12 @@ from osfcore.objects.fetch import MAX_TEXT
 VISITOR = "[A-Za-z0-9_-]+"
 
 # Texts
-Identifier = Annotated[str, Field(min_length=1, max_length=64)]
-ObjectName = Annotated[Identifier, Field(examples=["006_mustard_bottle"])]
 DisplayName = Annotated[str, Field(min_length=1, max_length=100)]  # for people: of goals, photos, episodes
 Label = Annotated[str, Field(max_length=MAX_TEXT)]  # for people: of objects, and their licences
 FileName = Annotated[str, Field(max_length=200)]
 Visitor = Annotated[Identifier, Field(pattern=f"^{VISITOR}$")]  # what a page calls itself
 
 # Numbers
-Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
-ImageSize = Annotated[int, Field(ge=MIN_IMAGE_SIDE, le=MAX_IMAGE_SIDE, description="Side of the square images [px].")]
-ObjectCount = Annotated[int, Field(ge=1, le=MAX_OBJECTS)]
-ImageCount = Annotated[int, Field(ge=60, le=5000)]  # of an image set
 Pixel = Annotated[FiniteFloat, Field(ge=0, le=100_000)]
 Box = Annotated[list[Pixel], Field(min_length=4, max_length=4, description="Left, top, right, bottom [px].")]
 

@@ -12,9 +12,10 @@ from pydantic import BaseModel, Field
 from app.api.bodies import PNG, upload
 from app.api.dependencies import Services, ServicesDep, slow
 from app.api.jobs import JobOut
-from app.api.models import FileName, Label, ObjectName, Vector3
+from app.api.models import FileName, Label, Vector3
 from app.api.paging import DamagedOut
 from app.api.problems import named_in_path, problems
+from app.jobs.params import ObjectName
 from osfcore.errors import OsfError
 from osfcore.objects.asset import ObjectInfo
 from osfcore.objects.catalogue import CATALOGUE

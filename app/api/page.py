@@ -10,9 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep, slow
 from app.api.goals import GoalOut
-from app.api.models import Identifier, Input, Visitor
+from app.api.models import Input, Visitor
 from app.api.problems import named_in_path, problems
 from app.api.scenes import SceneOut, scene_out
+from app.jobs.params import Identifier
 from app.services.examples import PRESETS, Stories, preset, set_up
 from app.storage.paths import static_folder
 from app.viewer.page_views import Replay, Shows, Wish

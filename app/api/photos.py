@@ -17,12 +17,13 @@ from app.api.bodies import JPEG, PNG, BoundedRoute, OpenFile, is_photo, kind_of,
 from app.api.dependencies import Services, ServicesDep, slow
 from app.api.goals import GoalOut
 from app.api.jobs import JobOut
-from app.api.models import Box, DisplayName, Identifier, Input, Pixel, Seed
+from app.api.models import Box, DisplayName, Input, Pixel
 from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
 from app.api.problems import named_in_path, problems
 from app.api.scenes import SceneOut, scene_out
 from app.jobs.job import Job
 from app.jobs.kinds.photos import sheet_name
+from app.jobs.params import Identifier, Seed
 from app.processes.messages.photo_messages import CameraSource, Mark, Points, Stroke
 from app.storage.records import MarkedObject, TablePhoto
 from osfcore.geometry.workspace import TABLE_SIDE_M

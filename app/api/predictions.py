@@ -13,8 +13,9 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field
 
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import ServicesDep
-from app.api.models import Input, LightIn, ObjectName, Position, Quaternion, Vector3, Velocity
+from app.api.models import Input, LightIn, Position, Quaternion, Vector3, Velocity
 from app.api.problems import problems
+from app.jobs.params import ObjectName
 from app.processes.messages.neural_messages import Predicted
 from app.processes.messages.scene_messages import SceneRecord
 from osfcore.errors import InvalidInput, UnknownName

@@ -11,9 +11,10 @@ from pydantic import BaseModel, Field
 from app.api.bodies import JPEG, BoundedRoute
 from app.api.dependencies import VISITOR_HEADER, ServicesDep, only_the_driver, slow, urgent
 from app.api.jobs import JobOut
-from app.api.models import Box, Horizon, Identifier, Input, ObjectNames, Samples, Seed, Steps, Visitor
+from app.api.models import Box, Horizon, Input, ObjectNames, Samples, Steps, Visitor
 from app.api.problems import named_in_path, problems
 from app.episodes.settings import ChosenSettings
+from app.jobs.params import Identifier, Seed
 from app.services.robot import AskedDrive, CameraNow, RobotNow, State
 from app.storage.database import utc_of
 from osfcore.io.scene_file import CameraJson, camera_to_json

@@ -11,9 +11,10 @@ from pydantic import BaseModel, Field
 
 from app.api.bodies import PNG, BoundedRoute
 from app.api.dependencies import Services, ServicesDep, slow
-from app.api.models import ImageSize, Input, LightIn, ObjectCount, ObjectNames, ObjectPose, Poses, Seed, Velocity
+from app.api.models import Input, LightIn, ObjectNames, ObjectPose, Poses, Velocity
 from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, PageOut, page
 from app.api.problems import NotFound, named_in_path, problems
+from app.jobs.params import ImageSize, ObjectCount, Seed
 from app.processes.messages.neural_messages import CompareView, Comparison
 from app.processes.messages.scene_messages import SceneRecord, TakeImage, TakeMask
 from app.processes.render_cameras import scene_camera

@@ -22,6 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from app.api.dependencies import ServicesDep, urgent
 from app.api.episodes import ServiceSettings
 from app.api.problems import named_in_path, problems
+from app.jobs.kinds.fields import TrainFieldParams
 from app.services.runner import Runner
 
 LEAST_FREE_BYTES = 50 << 20  # on the disk of the data directory; with less, the next episode may not fit
@@ -241,7 +242,7 @@ def usage(services: ServicesDep) -> StorageOut:
 @storage_router.get("/training")
 def leftovers(services: ServicesDep) -> LeftoverList:
     """List what trainings have left that failed, and what those that go on have made."""
-    jobs = {job.params["name"]: job.id for job in services.runner.jobs.live("train_field")}
+    jobs = {TrainFieldParams.from_json(job.params).name: job.id for job in services.runner.jobs.live("train_field")}
     return LeftoverList(
         leftovers=[
             LeftoverOut(name=left.name, bytes=left.bytes, changed_at=left.changed_at, job=jobs.get(left.name))

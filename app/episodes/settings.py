@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator
 
 from osfcore.control.events import CostKind, EpisodeSettings
 from osfcore.errors import InvalidInput
@@ -68,20 +70,15 @@ class ChosenSettings:
         )
 
     @classmethod
-    def of_job(cls, params: Mapping[str, Any]) -> ChosenSettings:
-        """Return the settings in a job's parameters; earlier versions stored those of the plan by themselves.
+    def of_stored(cls, stored: Mapping[str, Any]) -> ChosenSettings:
+        """Return settings that are stored with a job; earlier versions stored those of the plan by themselves.
 
         Raises:
             InvalidInput: if a number is out of range.
             TypeError: if there are settings that this version does not have.
         """
-        given = {key: value for key, value in params["settings"].items() if key != "plan"}
-        method = given.get("method", params.get("method", "ours"))
-        return cls.defaults(method).changed({**given, **params["settings"].get("plan", {})})
-
-    def to_job(self) -> dict[str, Any]:
-        """Return what `of_job` reads, as JSON."""
-        return asdict(self)
+        given = {key: value for key, value in stored.items() if key != "plan"}
+        return cls.defaults(given.get("method", "ours")).changed({**given, **stored.get("plan", {})})
 
     def changed(self, changes: Mapping[str, Any]) -> ChosenSettings:
         """Return settings of which some are other ones.
@@ -108,3 +105,9 @@ class ChosenSettings:
         return EpisodeSettings(
             self.steps, self.replan_every, self.cost, plan, self.planning, self.acting, self.despite_doubts
         )
+
+
+StoredSettings = Annotated[
+    ChosenSettings,
+    BeforeValidator(lambda stored: ChosenSettings.of_stored(stored) if isinstance(stored, Mapping) else stored),
+]

@@ -53,6 +53,11 @@ class Job:
     position: int | None = None
 
     @property
+    def scene(self) -> str | None:
+        """The scene that it drives, which is among the parameters of some kinds."""
+        return self.params.get("scene")
+
+    @property
     def is_finished(self) -> bool:
         """Whether nothing will change any more."""
         return self.state in FINISHED

@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osfcore.io.json_codec import Entry
+from app.jobs.params import JobParams
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
     from app.jobs.job import Job
 
-Params = dict[str, Any]
 
-
-def _refuse_nothing(params: Params, check_object: Callable[[str], object], available: int) -> None:
+def _refuse_nothing(params: object, check_object: Callable[[str], object], available: int) -> None:
     pass
 
 
@@ -35,7 +33,7 @@ class JobKind:
             are the job's result. A step may also have `view`, what the live view draws of it; `must_be_told`, if it
             must reach the service however soon it comes; and `ends_round`, where a job that goes on by single steps
             rests.
-        params: what parameters that were stored must hold for this version to show the job and go on with it.
+        params: of such a job, as REST takes them, as they are stored, and as `run` gets them.
         check: refuses parameters at once that `run` would refuse later, given a function that raises an OsfError for
             the name of an object that cannot be used, and how many objects there are.
         preloads: modules that a process in reserve has loaded before it is asked for such a job; none if no process
@@ -52,9 +50,9 @@ class JobKind:
 
     name: str
     words: str
-    run: Callable[[Params, JobContext], Iterator[Any]]
-    params: type[Entry] = Entry
-    check: Callable[[Params, Callable[[str], object], int], None] = _refuse_nothing
+    run: Callable[[Any, JobContext], Iterator[Any]]
+    params: type[JobParams]
+    check: Callable[[Any, Callable[[str], object], int], None] = _refuse_nothing
     preloads: tuple[str, ...] = ()
     uses_physics: bool = False
     has_folder: bool = True

@@ -180,7 +180,7 @@ class JobLoop:
             _log.warning("a job that takes no orders any more was not told what it had asked for")
 
     def _answer_to(self, run: JobProcess, asked: SceneCommand) -> Answer:
-        scene = self._table[run.id].params.get("scene")
+        scene = self._table[run.id].scene
         try:
             if self._serve is None or asked.command.id != scene:
                 raise UnknownName("scene of this job", asked.command.id, [str(scene)])

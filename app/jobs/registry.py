@@ -293,4 +293,4 @@ class Jobs:
 
     def _driving(self, scene: str) -> list[Job]:
         """Return the jobs that wait, run or pause and name a scene in their parameters."""
-        return [job for job in self.live() if job.params.get("scene") == scene]
+        return [job for job in self.live() if job.scene == scene]

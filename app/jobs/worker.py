@@ -68,7 +68,7 @@ def run_job(
     result: dict[str, Any] = {}
     last = 0.0
     context = JobContext(job.data_dir, job.folder, control)
-    with contextlib.closing(kind.run(job.params, context)) as steps:  # pyright: ignore[reportArgumentType]
+    with contextlib.closing(kind.run(kind.params.from_json(job.params), context)) as steps:  # pyright: ignore[reportArgumentType]
         for step in steps:
             result = _extras(step)
             now = time.monotonic()

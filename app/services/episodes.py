@@ -7,6 +7,7 @@ import shutil
 import threading
 import zipfile
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,13 +28,15 @@ from app.episodes.file_names import (
 from app.episodes.frames import Part, part_of, read_frame, read_frames, write_video
 from app.episodes.settings import ChosenSettings
 from app.jobs.job import Job, JobPage
+from app.jobs.kinds.clips import ClipParams
+from app.jobs.kinds.episodes import EpisodeGoal, EpisodeParams
 from app.processes.messages.scene_messages import ComposeGoal
 from app.services.examples import Stories
 from app.services.fields import FieldCatalogue
 from app.services.goals import GOAL_SIDE, GoalChecks, Goals, NoTable
 from app.services.runner import Runner
 from app.storage.database import CannotStore
-from app.storage.records import Poses, poses_to_json
+from app.storage.records import Poses
 from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed, shown
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import unit_quaternion
@@ -41,7 +44,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.io.files import file_at_once, read_json, write_atomically
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import Entry, decode
-from osfcore.io.scene_file import StateJson, camera_to_json
+from osfcore.io.scene_file import CameraJson, ObjectJson, StateJson
 from osfcore.paper.method import Method
 
 KIND, CLIP_KIND = "episode", "clip"
@@ -136,14 +139,8 @@ class Episodes:
         if goal is not None and poses is None and not settings.despite_doubts:
             self._checks.require(goal, scene)
         with self._runner.jobs.new_inputs() as folder:
-            params = {
-                "scene": scene,
-                "title": self._new_name(goal, names),
-                "names": list(names),
-                "seed": seed,
-                "settings": settings.to_job(),
-                "goal": self._goal(goal, poses, settings.method, scene, names, folder),
-            }
+            title, wanted = self._new_name(goal, names), self._goal(goal, poses, settings.method, scene, names, folder)
+            params = EpisodeParams(scene=scene, title=title, names=names, seed=seed, settings=settings, goal=wanted)
             job = self._runner.submit_with_inputs(KIND, params, folder)
         self._goals.drop_draft()  # what is composed cannot be moved while the episode has the scene
         return job
@@ -160,11 +157,11 @@ class Episodes:
             raise InvalidInput("method", method, f"{now.method}, as when the episode began")
         if now.method == "paper":
             raise InvalidInput("change of settings", "asked for", "left out: the method as published goes as it began")
-        return self._runner.jobs.change(job.id, {"settings": now.changed(settings).to_job()})
+        return self._runner.jobs.change(job.id, {"settings": asdict(now.changed(settings))})
 
     def _goal(
         self, goal_id: str | None, poses: Poses | None, method: Method, scene: str, names: tuple[str, ...], folder: Path
-    ) -> dict[str, Any]:
+    ) -> EpisodeGoal:
         """Return what the job is given of the goal; a goal image is copied for it."""
         if (goal_id is None) == (poses is None):
             raise NoGoal
@@ -174,8 +171,8 @@ class Episodes:
                 given = _of_all(poses or (), names)
                 if method == "paper":
                     return self._rendered(given, scene, folder)
-                wanted = poses_to_json(given)
-                return {"id": None, "camera": None, "poses": wanted, "truth": wanted}
+                wanted = _entries(given)
+                return EpisodeGoal(id=None, poses=wanted, truth=wanted)
             goal = self._goals.get(goal_id)
             shutil.copyfile(self._goals.image(goal.id), folder / GOAL_FILE)
             prepared = None if goal.example is None or goal.scene != scene else Stories().prepared(goal.example)
@@ -186,19 +183,18 @@ class Episodes:
         if goal.source == "photo" and goal.poses is not None:  # nothing is left to be read from its image
             given = _of_all(goal.poses, names)
             if method == "paper":
-                return {**self._rendered(given, scene, folder), "id": goal.id}
-            found = poses_to_json(given)
-            return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": found, "truth": found}
+                return self._rendered(given, scene, folder).model_copy(update={"id": goal.id})
+            found = _entries(given)
+            return EpisodeGoal(id=goal.id, camera=CameraJson.of(goal.camera), poses=found, truth=found)
         is_known = goal.poses is not None and goal.scene == scene and {name for name, _ in goal.poses} == set(names)
-        truth = poses_to_json(goal.poses) if is_known and goal.poses is not None else None
-        return {"id": goal.id, "camera": camera_to_json(goal.camera), "poses": None, "truth": truth}
+        truth = _entries(goal.poses) if is_known and goal.poses is not None else None
+        return EpisodeGoal(id=goal.id, camera=CameraJson.of(goal.camera), truth=truth)
 
-    def _rendered(self, poses: Poses, scene: str, folder: Path) -> dict[str, Any]:
+    def _rendered(self, poses: Poses, scene: str, folder: Path) -> EpisodeGoal:
         """A goal that was given as poses, as the image that a method wants which knows of nothing else."""
         made = self._runner.scenes.compose(ComposeGoal(scene, poses, size=GOAL_SIDE))
         write_atomically(folder / GOAL_FILE, made.png)
-        camera = camera_to_json(goal_camera(GOAL_SIDE))
-        return {"id": None, "camera": camera, "poses": None, "truth": poses_to_json(made.poses)}
+        return EpisodeGoal(id=None, camera=CameraJson.of(goal_camera(GOAL_SIDE)), truth=_entries(made.poses))
 
     def make_clip(self, job: Job) -> Job:
         """Queue the job that makes a clip of an episode; the one that is at it already, if there is one.
@@ -216,9 +212,9 @@ class Episodes:
             raise GoalUnknown
         self.trajectory(job)
         for other in self._runner.jobs.live(CLIP_KIND):
-            if other.params["episode"] == job.id:
+            if ClipParams.from_json(other.params).episode == job.id:
                 return other
-        return self._runner.submit_job(CLIP_KIND, {"episode": job.id, "title": self.name(job)})
+        return self._runner.submit_job(CLIP_KIND, ClipParams(episode=job.id, title=self.name(job)))
 
     # Telling of one
 
@@ -237,7 +233,7 @@ class Episodes:
             ended = (job.result or {}).get("outcome")
             if outcome not in (None, ended, job.state):
                 return False
-            labels = map(self._runner.library.label, job.params["names"]) if words else ()
+            labels = map(self._runner.library.label, EpisodeParams.from_json(job.params).names) if words else ()
             text = " ".join((self.name(job), *labels)).casefold()
             return all(word in text for word in words)
 
@@ -245,7 +241,8 @@ class Episodes:
 
     def name(self, job: Job) -> str:
         """What people call an episode: its own name, or that of its objects in episodes of earlier versions."""
-        return job.params.get("title") or ", ".join(map(self._runner.library.label, job.params["names"]))
+        params = EpisodeParams.from_json(job.params)
+        return params.title or ", ".join(map(self._runner.library.label, params.names))
 
     def rename(self, job: Job, name: str) -> Job:
         """Call an episode something else.
@@ -276,7 +273,7 @@ class Episodes:
     @staticmethod
     def settings(job: Job) -> ChosenSettings:
         """How an episode goes now."""
-        return ChosenSettings.of_job(job.params)
+        return EpisodeParams.from_json(job.params).settings
 
     # What one has left; its job makes it
 
@@ -391,6 +388,10 @@ def _of_all(poses: Poses, names: tuple[str, ...]) -> Poses:
     for name, pose in poses:
         unit_quaternion(pose.quaternion, f"quaternion of {name}")
     return poses
+
+
+def _entries(poses: Poses) -> tuple[ObjectJson, ...]:
+    return tuple(ObjectJson.of(name, pose) for name, pose in poses)
 
 
 def _pack(path: Path, files: list[Path]) -> None:

@@ -22,7 +22,9 @@ from app.jobs.kinds.estimates import (
     STATE,
     STEPS,
     TRUTH,
+    EstimateParams,
     Mode,
+    Source,
     check_method,
     read_steps,
     state_of_step,
@@ -132,7 +134,7 @@ class Estimates:
             write_json(folder / TRUTH, state_to_json(seen.record.state))
             if prior is not None:
                 write_estimated(folder / PRIOR, prior)
-            of = {"scene": scene, "revision": seen.record.revision, "file_name": None}
+            of = Source(scene=scene, revision=seen.record.revision)
             return self._submit(asked, of, names, tuple(camera.name for camera in seen.observation.cameras), folder)
 
     async def of_upload(self, asked: Asked, chunks: AsyncIterator[bytes], file_name: str) -> Job:
@@ -166,14 +168,13 @@ class Estimates:
         check_fits(asked.mode, uploaded)
         if asked.mode != "first" and not (uploaded.has_prior and asked.prior is None):
             write_estimated(folder / PRIOR, self._prior(asked, uploaded.names, None))
-        of = {"scene": None, "revision": None, "file_name": file_name}
+        of = Source(scene=None, file_name=file_name)
         return self._submit(asked, of, uploaded.names, uploaded.cameras, folder)
 
-    def _submit(
-        self, asked: Asked, of: dict[str, Any], names: tuple[str, ...], cameras: tuple[str, ...], folder: Path
-    ) -> Job:
-        how = {"mode": asked.mode, "method": asked.method, "seed": asked.seed}
-        params = {**how, "of": of, "names": list(names), "cameras": list(cameras)}
+    def _submit(self, asked: Asked, of: Source, names: tuple[str, ...], cameras: tuple[str, ...], folder: Path) -> Job:
+        params = EstimateParams(
+            mode=asked.mode, method=asked.method, seed=asked.seed, of=of, names=names, cameras=cameras
+        )
         return self._runner.submit_with_inputs(KIND, params, folder)
 
     def _prior(self, asked: Asked, names: tuple[str, ...], scene: str | None) -> EstimatedState:
@@ -185,8 +186,8 @@ class Estimates:
         elif scene is None:
             raise NoPrior(asked.mode, "in the archive (prior.json) or named in the request (prior)")
         else:
-            done = (job for job in self.all() if job.state == "done" and job.params["of"]["scene"] == scene)
-            job = next((job for job in done if job.params["mode"] != "goal"), None)
+            done = ((job, EstimateParams.from_json(job.params)) for job in self.all() if job.state == "done")
+            job = next((job for job, params in done if params.of.scene == scene and params.mode != "goal"), None)
             if job is None:
                 raise NoPrior(asked.mode, "of this scene")
         prior = self._state(job)
@@ -263,7 +264,7 @@ class Estimates:
             raise NoImages("they have been removed from the data directory") from None
 
     def _observed(self, job: Job, view: int) -> tuple[Camera, Path]:
-        names = job.params["cameras"]
+        names = EstimateParams.from_json(job.params).cameras
         if not 0 <= view < len(names):
             raise UnknownName("view", str(view), [str(number) for number in range(len(names))])
         folder = self._runner.jobs.inputs(job.id) / OBSERVATION

@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import AsyncIterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 
 from app.jobs.job import Job
-from app.jobs.kinds.objects import UPLOAD, MeshRefused
+from app.jobs.kinds.objects import UPLOAD, AddObjectParams, MeshRefused
 from app.processes.client import ProcessClient, ProcessUnavailable
 from app.processes.thumbnail_process import thumbnails_main
 from app.services.runner import RESERVED, Runner
@@ -103,7 +102,7 @@ class OwnObjects:
 
     def _check(self, new: NewObject) -> None:
         new.check()
-        is_coming = any(job.params["object"]["name"] == new.name for job in self._runner.jobs.live(KIND))
+        is_coming = any(AddObjectParams.from_json(job.params).name == new.name for job in self._runner.jobs.live(KIND))
         if is_coming or new.name in RESERVED or (self._runner.library.root / new.name).exists():
             raise ObjectTaken(new.name)
 
@@ -115,7 +114,7 @@ class OwnObjects:
         except CorruptFile as error:
             raise MeshRefused(str(error).replace(str(folder / UPLOAD), "The uploaded file")) from error
         self._check(new)  # others may have come in since the upload began
-        params = {"name": new.name, "object": asdict(new), "file_name": file_name}
+        params = AddObjectParams(name=new.name, object=new, file_name=file_name)
         return self._runner.submit_with_inputs(KIND, params, folder)
 
 

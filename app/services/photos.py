@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from app.jobs.job import Job
-from app.jobs.kinds.photos import FOUND, inputs_of
+from app.jobs.kinds.photos import FOUND, PhotoInput, PhotoParams, inputs_of
 from app.processes.client import ProcessClient, ProcessHangs
 from app.processes.messages.neural_messages import DrawPhoto
 from app.processes.messages.photo_messages import (
@@ -242,13 +242,13 @@ class TablePhotos:
         boards = sum(each.T_world_camera is not None for each in photos)
         if len(photos) > 1 and boards < len(photos):
             raise InvalidInput("photos with the board in view", f"{boards} of {len(photos)}", "all of them")
-        names = list(dict.fromkeys(entry.name for each in photos for entry in each.objects))
+        names = tuple(dict.fromkeys(entry.name for each in photos for entry in each.objects))
         self._fields.require(names, "ours")
         self._end_search(first)
-        params = {
-            "photo": first.id, "title": first.name, "names": names, "seed": seed, "notes": list(first.notes),
-            "photos": [_order(each) for each in photos],
-        }  # fmt: skip
+        params = PhotoParams(
+            photo=first.id, title=first.name, names=names, seed=seed, notes=first.notes,
+            photos=tuple(map(_order, photos)),
+        )  # fmt: skip
         with self._runner.jobs.new_inputs() as folder:
             self._copy(photos, folder)
             job = self._runner.submit_with_inputs(KIND, params, folder)
@@ -365,9 +365,9 @@ def _is_same(one: TablePhoto, other: TablePhoto) -> bool:
     return next(marks) == next(marks) and np.array_equal(one.K, other.K)
 
 
-def _order(photo: TablePhoto) -> dict[str, object]:
+def _order(photo: TablePhoto) -> PhotoInput:
     T = None if photo.T_world_camera is None else photo.T_world_camera.matrix().tolist()
-    return {"K": photo.K.tolist(), "T_world_camera": T, "names": [entry.name for entry in photo.objects]}
+    return PhotoInput(K=photo.K.tolist(), T_world_camera=T, names=[entry.name for entry in photo.objects])
 
 
 # What becomes of a photographed table: a table of the simulation, or a goal of one; and how it looks when drawn

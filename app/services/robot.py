@@ -19,7 +19,7 @@ from jaxtyping import UInt8
 from app.episodes.file_names import GOAL_FILE
 from app.episodes.settings import ChosenSettings
 from app.jobs.job import Job, JobChanged
-from app.jobs.kinds.robots import CameraPicture, read_picture
+from app.jobs.kinds.robots import CameraPicture, RobotParams, read_picture
 from app.services.event_hub import Notice
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
@@ -301,16 +301,17 @@ class RobotTable:
             QueueFull, StorageFull, CannotStore: if nothing more can be taken.
         """
         cameras = [camera.name for camera in self._described().cameras]
+        assert self._url is not None, "or it had not been described"
         goal = self._goals.get(asked.goal)
         if goal.camera.name not in cameras:
             raise UnknownName("camera of the robot", goal.camera.name, cameras)
         check_unique("objects", asked.names, "each named once")
         self._fields.require(asked.names, "ours")
-        params = {
-            "url": self._url, "title": goal.name, "names": list(asked.names), "goal_camera": goal.camera.name,
-            "boxes": {camera: dict(boxes) for camera, boxes in asked.boxes.items()}, "seed": asked.seed,
-            "settings": asked.settings.to_job(), "box": self._limits.box, "top_speed_m_s": self._limits.top_speed_m_s,
-        }  # fmt: skip
+        params = RobotParams(
+            url=self._url, title=goal.name, names=asked.names, goal_camera=goal.camera.name,
+            boxes={camera: dict(boxes) for camera, boxes in asked.boxes.items()}, seed=asked.seed,
+            settings=asked.settings, box=self._limits.box, top_speed_m_s=self._limits.top_speed_m_s,
+        )  # fmt: skip
         with self._ordering, self._runner.jobs.new_inputs() as folder:
             if self._live() is not None:
                 raise RobotBusy

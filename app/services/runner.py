@@ -8,10 +8,12 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from app.jobs.job import Job, JobChanged, JobEvent
 from app.jobs.kinds import KINDS, in_words
+from app.jobs.kinds.episodes import EpisodeParams
+from app.jobs.kinds.fields import TrainFieldParams
+from app.jobs.params import JobParams
 from app.jobs.process import JobProcess, Standby
 from app.jobs.registry import Jobs
 from app.services.event_hub import Hub, Notice
@@ -41,7 +43,8 @@ class SetInUse(OsfError):
     """An image set that a job needs."""
 
     def __init__(self, job: Job) -> None:
-        super().__init__(f"A training of {job.params['name']} needs these images; wait for it or cancel it first.")
+        name = TrainFieldParams.from_json(job.params).name
+        super().__init__(f"A training of {name} needs these images; wait for it or cancel it first.")
 
 
 class SceneNeeded(OsfError):
@@ -154,7 +157,7 @@ class Runner:
         """Time since the service was made [s]."""
         return time.monotonic() - self._started
 
-    def submit_job(self, kind: str, params: dict[str, Any]) -> Job:
+    def submit_job(self, kind: str, params: JobParams) -> Job:
         """Queue a job.
 
         Raises:
@@ -164,18 +167,18 @@ class Runner:
         self.storage.check_room()
         fetches = kind == "fetch_assets"
         with self._ordering:
-            if kind == "train_field":
+            if isinstance(params, TrainFieldParams):
                 self._check_training(params)
             known = self.library.info if fetches else self.library.check
             KINDS[kind].check(params, known, len(self.library.names()))
-            return self.jobs.submit(kind, params)
+            return self.jobs.submit(kind, params.to_json())
 
-    def submit_with_inputs(self, kind: str, params: dict[str, Any], inputs: Path) -> Job:
+    def submit_with_inputs(self, kind: str, params: JobParams, inputs: Path) -> Job:
         """Queue a job that was given files.
 
         Args:
             kind: what to do.
-            params: with what; "scene" names one that it drives.
+            params: with what, and perhaps the scene that it drives.
             inputs: see `Jobs.submit`.
 
         Raises:
@@ -185,9 +188,9 @@ class Runner:
         """
         self.storage.check_room()
         with self._ordering:
-            if "scene" in params:
-                self.scenes.get(params["scene"])
-            return self.jobs.submit(kind, params, inputs)
+            if isinstance(params, EpisodeParams):
+                self.scenes.get(params.scene)
+            return self.jobs.submit(kind, params.to_json(), inputs)
 
     def forget_job(self, job: str) -> None:
         """Remove a finished job for good, with all its files, see `Jobs.forget`."""
@@ -223,7 +226,7 @@ class Runner:
             if name not in names:
                 raise UnknownName("training", name[:80], names)
             for job in self.jobs.live("train_field"):
-                if job.params["name"] == name:
+                if TrainFieldParams.from_json(job.params).name == name:
                     raise WorkshopInUse(name, job)
             remove_workshop(self._settings.data_dir, name)
         self.storage.outdate()
@@ -237,7 +240,7 @@ class Runner:
         """
         with self._ordering:
             for job in self.jobs.live("train_field"):
-                if job.params["source"]["set"] == set_id:
+                if TrainFieldParams.from_json(job.params).source.set == set_id:
                     raise SetInUse(job)
             self.sets.remove(set_id)
         self.storage.outdate()
@@ -262,16 +265,16 @@ class Runner:
 
     # Inside
 
-    def _check_training(self, params: dict[str, Any]) -> None:
-        name, source = check_name(params["name"]), params["source"]
+    def _check_training(self, params: TrainFieldParams) -> None:
+        name, source = check_name(params.name), params.source
         if name in RESERVED:
             raise InvalidInput("object name", repr(name), "another one; this one is taken")
-        if source["mesh"] is not None:
-            self.library.check(source["mesh"])
-        else:
-            self.sets.get(source["set"])
+        if source.mesh is not None:
+            self.library.check(source.mesh)
+        elif source.set is not None:
+            self.sets.get(source.set)
         for job in self.jobs.live("train_field"):
-            if job.params["name"] == name:
+            if TrainFieldParams.from_json(job.params).name == name:
                 raise TrainingAlready(name)
 
     def _on_job(self, event: JobEvent) -> None:
@@ -280,8 +283,7 @@ class Runner:
             case JobChanged(_, Job(kind="fetch_assets" | "add_object", state="done")):
                 self.ensure_demo_scene()
             case JobChanged(_, Job(kind="episode") as job) if job.is_finished:
-                scene = job.params["scene"]
-                if self.jobs.needs(scene) is None:
+                if (scene := job.scene) is not None and self.jobs.needs(scene) is None:
                     # In the background: the jobs' thread must not wait for the simulation.
                     threading.Thread(target=self._undo_disturbances, args=(scene,), daemon=True).start()
             case _:

@@ -11,6 +11,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
+from app.jobs.params import MAX_SEED
 from app.processes.client import ProcessClient, Status
 from app.processes.messages.scene_messages import (
     Act,
@@ -48,7 +49,6 @@ from osfcore.geometry.workspace import check_action
 from osfcore.objects.asset_library import AssetLibrary
 
 DEMO_OBJECTS = 3
-MAX_SEED = 2**31 - 1
 _LOST = "The simulation stopped unexpectedly and is being restarted."
 
 

@@ -398,11 +398,6 @@ class GoalStore(RecordFolders[GoalRecord]):
         self._replace(record, {IMAGE: png})
 
 
-def poses_to_json(poses: Poses) -> list[dict[str, Any]]:
-    """Return poses as in scene.json."""
-    return [encode(ObjectJson.of(name, pose)) for name, pose in poses]
-
-
 # Photographs of tables: DATA_DIR/photos/ID with `photo.json`, the file as sent, what is shown of it, and masks.
 
 SENT, STRAIGHT, PICTURE = "sent", "straight.png", "photo.jpg"

@@ -13,6 +13,7 @@ from functools import partial
 import viser
 
 from app.jobs.job import Job, JobChanged, JobView
+from app.jobs.kinds.estimates import EstimateParams
 from app.processes.messages.scene_messages import SceneChanged
 from app.services import episodes, estimates
 from app.services.event_hub import CurrentScene
@@ -113,7 +114,7 @@ class EstimatePanel(Panel):
 
     def _is_here(self, job: Job) -> bool:
         """Check whether it is about what is on view; uploads are shown on any table."""
-        return job.params["of"]["scene"] in (None, self._current)
+        return EstimateParams.from_json(job.params).of.scene in (None, self._current)
 
     def _draw(self) -> None:
         with self._thread.changed:
@@ -150,7 +151,7 @@ class _EpisodeState:
 
     def is_on(self, scene: str | None) -> bool:
         """Check whether it is about a scene."""
-        return self.job is not None and self.job.params["scene"] == scene
+        return self.job is not None and self.job.scene == scene
 
     def with_job(self, job: Job) -> _EpisodeState:
         """Make the state after a change of the job; empty for another job."""

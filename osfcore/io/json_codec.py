@@ -77,18 +77,22 @@ def encode(value: object) -> Any:  # noqa: ANN401
     return _adapter(type(value)).dump_python(value, mode="json", exclude_unset=True)
 
 
-def decode(kind: type[T], data: object, what: str) -> T:
+def decode(kind: type[T], data: object, what: str, *, is_stored: bool = False) -> T:
     """Return an entry or a dataclass of parsed JSON.
 
     Args:
         kind: its class.
         data: what `json.loads` returned.
         what: name of the whole for the message, such as "scene".
+        is_stored: whether it is what a program has written, perhaps another version: lists stand for tuples, and
+            members that are unknown are left out, although the class refuses them.
 
     Raises:
         InvalidInput: for the first thing that does not fit; the message says where it stands.
     """
     try:
+        if is_stored:
+            return _adapter(kind).validate_python(data, strict=False, extra="ignore")
         return _adapter(kind).validate_python(data)
     except ValidationError as error:
         raise _refusal(error.errors(include_url=False)[0], data, what) from None

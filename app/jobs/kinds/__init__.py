@@ -16,7 +16,6 @@ from app.jobs.kinds.objects import ADD_OBJECT
 from app.jobs.kinds.photos import PHOTO
 from app.jobs.kinds.robots import ROBOT
 from osfcore.errors import InvalidInput, shown
-from osfcore.io.json_codec import decode
 
 KindName = Literal[
     "collect_pushes", "collect_object", "collect_table", "fetch_assets", "add_object", "train_field", "estimate",
@@ -43,4 +42,4 @@ def check_stored(job: Job) -> None:
     """
     if job.kind not in KINDS:
         raise InvalidInput("kind of job", shown(job.kind), f"one of {', '.join(KINDS)}")
-    decode(KINDS[job.kind].params, job.params, "job")
+    KINDS[job.kind].params.from_json(job.params)

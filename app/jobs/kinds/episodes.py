@@ -8,19 +8,21 @@ known, is for the report alone. It leaves what `osf episode` leaves. The method 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import AfterValidator
+from pydantic import model_validator
 
 from app.episodes.file_names import GOAL_FILE, PREPARED_FILE, RECORDING_FILE
 from app.episodes.progress import EpisodeProgress
+from app.episodes.settings import ChosenSettings, StoredSettings
 from app.jobs.job import INPUTS
 from app.jobs.kind import JobKind
+from app.jobs.params import JobParams
 from app.processes.messages.scene_messages import Act, JobCommand, ObservedScene, ObserveScene, SceneRecord, TakeView
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
@@ -28,8 +30,7 @@ from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.geometry.workspace import check_action
 from osfcore.io.files import read_json
-from osfcore.io.json_codec import Entry, Text, decode
-from osfcore.io.scene_file import ObjectJson, camera_from_json
+from osfcore.io.scene_file import CameraJson, ObjectJson
 from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
 
@@ -79,7 +80,50 @@ class EpisodeJobProgress(EpisodeProgress):
         return self.view is not None and not isinstance(self.view, Looking)
 
 
-def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeJobProgress]:
+class EpisodeGoal(JobParams):
+    """Goal poses, or the camera that took the goal image.
+
+    Attributes:
+        id: of the goal; None if poses were given for this episode alone.
+        camera: as in scene.json; None without an image.
+        poses: where the objects shall be; None if that is to be read from the image.
+        truth: where they are in the image, for the report alone; None where nobody knows.
+    """
+
+    id: str | None
+    camera: CameraJson | None = None
+    poses: tuple[ObjectJson, ...] | None = None
+    truth: tuple[ObjectJson, ...] | None = None
+
+
+class EpisodeParams(JobParams):
+    """The scene that is driven, and how.
+
+    Attributes:
+        scene: its identifier.
+        title: what the episode is called; None if it has no name.
+        names: of the scene's objects.
+        seed: of the searches.
+        settings: at the beginning, or what they were changed to.
+        goal: what the table shall look like.
+    """
+
+    scene: str
+    title: str | None = None
+    names: tuple[str, ...]
+    seed: int
+    settings: StoredSettings
+    goal: EpisodeGoal
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_earlier_versions(cls, stored: dict[str, Any]) -> dict[str, Any]:
+        if "method" not in stored or not isinstance(stored.get("settings"), dict):
+            return stored
+        return {**stored, "settings": {"method": stored["method"], **stored["settings"]}}
+
+
+def episode_job(params: EpisodeParams, place: JobContext) -> Iterator[EpisodeJobProgress]:
     """Run an episode.
 
     Raises:
@@ -89,25 +133,23 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeJo
     from app.episodes.progress import TimeLeft
     from app.episodes.record import About, EpisodeRecord, recorded
     from app.episodes.recording import write_recording
-    from app.episodes.settings import ChosenSettings
     from osfcore.control.closed_loop import Episode
     from osfcore.control.goal import GoalImage
     from osfcore.fields.devices import use_one_thread
 
     assert place.orders is not None, "the job's process sets it"
     use_one_thread()
-    chosen, names = ChosenSettings.of_job(params), tuple(params["names"])
-    settings, method = chosen.of_loop(), chosen.method
+    names, settings, method = params.names, params.settings.of_loop(), params.settings.method
     yield EpisodeJobProgress(0, 0, "Loading fields, half a minute the first time")
     models = _models(method, names, place)
-    world = RemoteWorld(place.orders.ask, params["scene"])
-    goal, start = params["goal"], world.truth()
-    target = None if goal["truth"] is None else SceneState(names, _poses(goal["truth"], names), start.light, None)
-    inputs, rng = place.folder / INPUTS, stream_rng(params["seed"], Stream.EPISODE)
+    world = RemoteWorld(place.orders.ask, params.scene)
+    goal, start = params.goal, world.truth()
+    target = None if goal.truth is None else SceneState(names, _poses(goal.truth, names), start.light, None)
+    inputs, rng = place.folder / INPUTS, stream_rng(params.seed, Stream.EPISODE)
     wanted, prepared = _goal(goal, names, inputs), _prepared(inputs / PREPARED_FILE)
     image = wanted if method == "paper" else None
     assert image is None or isinstance(image, GoalImage), "the service renders poses for it"
-    about = About(names, params["seed"], settings, target, _moved(start, target), models.symmetries, method, image)
+    about = About(names, params.seed, settings, target, _moved(start, target), models.symmetries, method, image)
     record = EpisodeRecord(place.folder, world, about)
     if image is None:
         loop = Episode(world, models, wanted, settings, rng, prepared=prepared)
@@ -118,7 +160,7 @@ def episode_job(params: dict[str, Any], place: JobContext) -> Iterator[EpisodeJo
     with contextlib.closing(record):
         for event in recorded(loop.run(), record):
             for change in place.orders.changes():
-                loop.settings = ChosenSettings.of_job(change).of_loop()
+                loop.settings = ChosenSettings.of_stored(change["settings"]).of_loop()
             share, left_s = timer.take(event, progress.total or settings.steps)
             progress = replace(
                 progress.after(event), share=share, left_s=round(left_s, 1), seconds=record.seconds,
@@ -185,17 +227,17 @@ def _drawn(event: Event) -> Event | PlanSketch | None:
             return event
 
 
-def _goal(given: Mapping[str, Any], names: tuple[str, ...], inputs: Path) -> GoalImage | PoseGoal:
+def _goal(given: EpisodeGoal, names: tuple[str, ...], inputs: Path) -> GoalImage | PoseGoal:
     """The goal image among the inputs, or the poses in the parameters, with a photograph of them if there is one."""
     from app.episodes.request import read_goal
     from osfcore.control.goal import PhotoGoal
     from osfcore.planning.costs import PoseGoal
 
-    image = None if given["camera"] is None else read_goal(inputs / GOAL_FILE, camera_from_json(given["camera"]))
-    if given["poses"] is None:
+    image = None if given.camera is None else read_goal(inputs / GOAL_FILE, given.camera.camera())
+    if given.poses is None:
         assert image is not None, "the service gives one or the other"
         return image
-    poses = _poses(given["poses"], names)
+    poses = _poses(given.poses, names)
     return PoseGoal(names, poses) if image is None else PhotoGoal(names, poses, image)
 
 
@@ -206,11 +248,11 @@ def _prepared(path: Path) -> PreparedLooks | None:
     return read_json(path, prepared_from_json) if path.is_file() else None
 
 
-def _poses(data: object, names: tuple[str, ...]) -> Pose:
-    """Poses from JSON, in the order of `names`."""
-    by_name = {entry.name: entry for entry in decode(list[ObjectJson], data, "poses")}
-    entries = [by_name[name] for name in names]
-    return Pose(np.array([entry.position for entry in entries]), np.array([entry.quaternion for entry in entries]))
+def _poses(entries: tuple[ObjectJson, ...], names: tuple[str, ...]) -> Pose:
+    """Poses in the order of `names`."""
+    by_name = {entry.name: entry for entry in entries}
+    ordered = [by_name[name] for name in names]
+    return Pose(np.array([entry.position for entry in ordered]), np.array([entry.quaternion for entry in ordered]))
 
 
 def _moved(start: SceneState, target: SceneState | None) -> tuple[str, ...]:
@@ -289,32 +331,11 @@ class RemoteWorld:
 # The kind of job
 
 
-class _Goal(Entry):
-    id: Text | None
-
-
-def _known_settings(given: dict[str, Any]) -> dict[str, Any]:
-    from app.episodes.settings import ChosenSettings
-
-    ChosenSettings.of_job({"settings": given})
-    return given
-
-
-class EpisodeParams(Entry):
-    """What a stored episode must name."""
-
-    scene: Text
-    names: list[Text]
-    seed: int
-    settings: Annotated[dict[str, Any], AfterValidator(_known_settings)]
-    goal: _Goal
-
-
 EPISODE = JobKind(
     "episode",
     "episode",
     episode_job,
-    params=EpisodeParams,
+    EpisodeParams,
     preloads=(
         "osfcore.world.tabletop", "osfcore.control.closed_loop", "osfcore.control.estimators",
     ),

@@ -17,8 +17,9 @@ import numpy as np
 
 from app.jobs.job import INPUTS
 from app.jobs.kind import JobKind
+from app.jobs.params import JobParams
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
-from osfcore.io.json_codec import Entry, Text, decode
+from osfcore.io.json_codec import decode
 from osfcore.io.scene_file import StateJson, state_to_json
 from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
@@ -32,6 +33,25 @@ if TYPE_CHECKING:
 Mode = Literal["first", "next", "goal"]
 OBSERVATION, PRIOR, TRUTH = "observation", "prior.json", "truth.json"
 STEPS, STATE = "steps.jsonl", "state.json"
+
+
+class Source(JobParams):
+    """Where an observation came from: a scene as it was, or a file that was sent."""
+
+    scene: str | None
+    revision: int | None = None
+    file_name: str | None = None
+
+
+class EstimateParams(JobParams):
+    """What is estimated, and how; earlier versions had one method."""
+
+    mode: Mode
+    method: Method = "ours"
+    seed: int
+    of: Source
+    names: tuple[str, ...]
+    cameras: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,7 +81,7 @@ class Estimating:
     view: EstimateStep | None = None
 
 
-def estimate_job(params: dict[str, Any], place: JobContext) -> Iterator[Estimating]:
+def estimate_job(params: EstimateParams, place: JobContext) -> Iterator[Estimating]:
     """Estimate what was observed.
 
     Raises:
@@ -73,12 +93,11 @@ def estimate_job(params: dict[str, Any], place: JobContext) -> Iterator[Estimati
     yield Estimating(0, 0, "Loading fields, half a minute the first time")
     inputs = place.folder / INPUTS
     observation = read_observation(inputs / OBSERVATION)
-    mode: Mode = params["mode"]
+    mode = params.mode
     prior = None if mode == "first" else read_estimated(inputs / PRIOR).state
-    method: Method = params.get("method", "ours")  # earlier versions had but one
-    models = load_models(place.data_dir, observation.names, method)
-    rng = stream_rng(params["seed"], Stream.FIRST_FRAME)
-    for number, step in enumerate(steps_of(mode, models, observation, prior, rng, method), 1):
+    models = load_models(place.data_dir, observation.names, params.method)
+    rng = stream_rng(params.seed, Stream.FIRST_FRAME)
+    for number, step in enumerate(steps_of(mode, models, observation, prior, rng, params.method), 1):
         progress = _progress_of(number, step)
         _keep(place.folder / STEPS, progress, step.state)
         if step.estimate is not None:
@@ -201,24 +220,11 @@ def _keep(path: Path, progress: Estimating, state: SceneState) -> None:
         raise CannotWrite(path, error.strerror or str(error)) from error
 
 
-class _Of(Entry):
-    scene: Text | None
-
-
-class EstimateParams(Entry):
-    """What a stored estimate must name."""
-
-    mode: Text
-    names: list[Text]
-    cameras: list[Text]
-    of: _Of
-
-
 ESTIMATE = JobKind(
     "estimate",
     "estimate",
     estimate_job,
-    params=EstimateParams,
+    EstimateParams,
     preloads=("osfcore.control.estimators", "app.jobs.kinds.estimates"),
     ends_at_once=True,
 )

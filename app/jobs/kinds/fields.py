@@ -14,14 +14,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import Field, model_validator
+
 from app.jobs.job import Job
 from app.jobs.kind import JobKind
+from app.jobs.params import Identifier, ImageCount, JobParams, ObjectName, Seed
 from app.storage.field_files import clear_workshop, install, install_published, open_workshop
 from osfcore.errors import CannotWrite, CorruptFile
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldLibrary
 from osfcore.io.files import write_atomically
 from osfcore.io.image_file import write_png
-from osfcore.io.json_codec import Entry, Text
 from osfcore.paper.method import Method, own_field_path
 
 if TYPE_CHECKING:
@@ -33,6 +35,43 @@ _COMPARING = "Comparing it with the field that is there"
 # What the parts count in the progress: about as long as they take on two cores [s], most of them for each image.
 _START_S, _CARVE_S = 4, 6
 _TAKE_S, _MEASURE_S, _COMPARE_S = 0.08, 0.035, 0.08
+
+
+class FieldSource(JobParams):
+    """What to learn a field from: a mesh, of which images are then taken first, or an uploaded image set."""
+
+    mesh: ObjectName | None = Field(None, description="An object whose mesh is on this machine.")
+    set: Identifier | None = Field(None, description="Identifier of an uploaded image set.")
+
+    @model_validator(mode="after")
+    def _names_one(self) -> FieldSource:
+        if (self.mesh is None) == (self.set is None):
+            raise ValueError("give either mesh or set")
+        return self
+
+
+class TrainFieldParams(JobParams):
+    """A field to train. It replaces one of this name only if it is no worse on the same held-out images.
+
+    But for one as published: that takes the place of an earlier one as published, and never that of ours.
+    """
+
+    name: ObjectName = Field(description="Of the field; scenes need a mesh of the same name.")
+    source: FieldSource
+    minutes: float = Field(30, ge=0.1, le=1440, description="How long to train [min].")
+    seed: Seed = 0
+    images: ImageCount = Field(300, description="Images to take of a mesh; a set has its own.")
+    hollow: bool = Field(False, description="The object has hollows that no silhouette shows, such as a bowl's.")
+    method: Method = Field(
+        "ours",
+        description='Whose field: "ours", or "paper", a KiloOSF as published, which is kept beside ours, uncompared.',
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> TrainFieldParams:
+        if self.method == "paper" and self.hollow:
+            raise ValueError("hollow is of our method alone; leave it out with the one as published")
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +108,7 @@ class TrainingStep:
         return self.note == _COMPARING
 
 
-def train_field_job(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep]:
+def train_field_job(params: TrainFieldParams, place: JobContext) -> Iterator[TrainingStep]:
     """Train a field, and put it in place unless one that is better is there.
 
     The same order after a kill goes on from the images and the checkpoint that are there.
@@ -81,12 +120,11 @@ def train_field_job(params: dict[str, Any], place: JobContext) -> Iterator[Train
         yield replace(step, left_s=float(step.total - step.done))
 
 
-def _trained(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep]:
-    name, mesh, images = params["name"], params["source"]["mesh"], _image_count(params, place)
+def _trained(params: TrainFieldParams, place: JobContext) -> Iterator[TrainingStep]:
+    name, mesh, images = params.name, params.source.mesh, _image_count(params, place)
     collect_s = _START_S + round(_TAKE_S * images) if mesh else _START_S
-    train_s = _CARVE_S + max(1, round(60 * params["minutes"])) + round(_MEASURE_S * images)
-    method: Method = params.get("method", "ours")
-    compare_s = round(_COMPARE_S * images) if _is_compared(name, method, place) else 0
+    train_s = _CARVE_S + max(1, round(60 * params.minutes)) + round(_MEASURE_S * images)
+    compare_s = round(_COMPARE_S * images) if _is_compared(name, params.method, place) else 0
     step = TrainingStep(0, collect_s + train_s + compare_s, "Starting")
     yield step
     shop = open_workshop(place.data_dir, name, _order(params, place))
@@ -94,7 +132,7 @@ def _trained(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep
         data = shop / mesh
         yield from _collect(mesh, params, data, place, step)
     else:
-        data = place.data_dir / "sets" / params["source"]["set"] / "images"
+        data = _uploaded(params.source, place)
     step = replace(step, done=collect_s)
     if not (shop / METRICS_FILE).is_file():  # it is written last
         begin = step
@@ -103,12 +141,12 @@ def _trained(params: dict[str, Any], place: JobContext) -> Iterator[TrainingStep
             yield step
     metrics = json.loads((shop / METRICS_FILE).read_text(encoding="utf-8"))
     step = replace(step, done=collect_s + train_s, psnr_full=metrics["psnr_full"], psnr_mask=metrics["psnr_mask"])
-    if _is_compared(name, method, place):
+    if _is_compared(name, params.method, place):
         yield replace(step, note=_COMPARING)
         with contextlib.suppress(CorruptFile):  # a damaged one is replaced
             step = _compared(step, name, data, shop, place)
     in_use = step.before_mask is None or step.psnr_mask is None or step.psnr_mask >= step.before_mask
-    if method == "paper":
+    if params.method == "paper":
         install_published(shop, own_field_path(name, place.data_dir))
     elif in_use:
         install(shop, place.data_dir / "fields" / name)
@@ -142,35 +180,40 @@ def _compared(step: TrainingStep, name: str, data: Path, shop: Path, place: JobC
     )
 
 
-def _image_count(params: dict[str, Any], place: JobContext) -> int:
+def _uploaded(source: FieldSource, place: JobContext) -> Path:
+    assert source.set is not None, "it is one or the other"
+    return place.data_dir / "sets" / source.set / "images"
+
+
+def _image_count(params: TrainFieldParams, place: JobContext) -> int:
     """How many images are taken, or are in the uploaded set."""
-    if params["source"]["mesh"]:
-        return int(params["images"])
-    return len(list((place.data_dir / "sets" / params["source"]["set"] / "images").glob("*/*.png")))
+    if params.source.mesh:
+        return params.images
+    return len(list(_uploaded(params.source, place).glob("*/*.png")))
 
 
-def _order(params: dict[str, Any], place: JobContext) -> dict[str, Any]:
+def _order(params: TrainFieldParams, place: JobContext) -> dict[str, Any]:
     """What an earlier run must have been about for this one to go on from it: the same order of the same mesh."""
-    mesh = params["source"]["mesh"]
+    mesh = params.source.mesh
     facts = place.library.root / mesh / "object.json" if mesh else None
     changed_at = facts.stat().st_mtime_ns if facts is not None and facts.is_file() else None
-    return {**params, "mesh_changed_at": changed_at}
+    return {**params.to_json(), "mesh_changed_at": changed_at}
 
 
 def _collect(
-    mesh: str, params: dict[str, Any], out: Path, place: JobContext, begin: TrainingStep
+    mesh: str, params: TrainFieldParams, out: Path, place: JobContext, begin: TrainingStep
 ) -> Iterator[TrainingStep]:
     from osfcore.world.collect_images import CollectObject, collect_object
 
     if out.is_dir():  # whole, or it would not have its name
         return
-    config = CollectObject(mesh, out, params["images"], seed=params["seed"])
+    config = CollectObject(mesh, out, params.images, seed=params.seed)
     for progress in collect_object(config, place.library):
         yield replace(begin, done=_START_S + round(_TAKE_S * progress.done), note=progress.note)
 
 
 def _train(
-    params: dict[str, Any], files: tuple[Path, Path, Path], begin: TrainingStep, train_s: int
+    params: TrainFieldParams, files: tuple[Path, Path, Path], begin: TrainingStep, train_s: int
 ) -> Iterator[TrainingStep]:
     """Train for about `train_s`; `files` are the images, the field and a preview of it."""
     data, out, preview = files
@@ -190,17 +233,17 @@ def _train(
         )
 
 
-def _learning(params: dict[str, Any], data: Path, out: Path) -> Iterator[FieldStep]:
+def _learning(params: TrainFieldParams, data: Path, out: Path) -> Iterator[FieldStep]:
     """The training of the method that is asked for."""
-    minutes, seed = params["minutes"], params["seed"]
-    if params.get("method") == "paper":
+    minutes, seed = params.minutes, params.seed
+    if params.method == "paper":
         from osfcore.fields.train_osf import FieldSettings
         from osfcore.paper.train_fields import train_paper_field
 
         return train_paper_field(FieldSettings(data, out, minutes=minutes, seed=seed))
     from osfcore.fields.train_kiloosf import TrainField, train_field
 
-    return train_field(TrainField(data, out, minutes=minutes, seed=seed, hollow=params["hollow"]))
+    return train_field(TrainField(data, out, minutes=minutes, seed=seed, hollow=params.hollow))
 
 
 def _offer(shop: Path, folder: Path, name: str) -> None:
@@ -212,25 +255,11 @@ def _offer(shop: Path, folder: Path, name: str) -> None:
         raise CannotWrite(folder, error.strerror or str(error)) from error
 
 
-class _Source(Entry):
-    mesh: Text | None
-    set: Text | None
-
-
-class TrainingParams(Entry):
-    """What a stored training must name."""
-
-    name: Text
-    source: _Source
-
-
 def _clear(data_dir: Path, job: Job, others: Sequence[Job]) -> None:
     """Remove what the next training of this name would find, unless another one works there."""
-    name = job.params["name"]
-    if not any(other.params["name"] == name for other in others):
+    name = TrainFieldParams.from_json(job.params).name
+    if not any(TrainFieldParams.from_json(other.params).name == name for other in others):
         clear_workshop(data_dir, name)
 
 
-TRAIN_FIELD = JobKind(
-    "train_field", "training", train_field_job, params=TrainingParams, goes_on=True, on_cancelled=_clear
-)
+TRAIN_FIELD = JobKind("train_field", "training", train_field_job, TrainFieldParams, goes_on=True, on_cancelled=_clear)

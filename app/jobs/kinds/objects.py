@@ -6,17 +6,17 @@ import resource
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from app.jobs.job import INPUTS
 from app.jobs.kind import JobKind
+from app.jobs.params import JobParams
 from app.processes.child_process import limit_memory
 from osfcore.errors import InvalidInput, OsfError
-from osfcore.io.json_codec import Entry, Text
+from osfcore.objects.fetch import NewObject
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
-    from osfcore.objects.fetch import NewObject
     from osfcore.objects.mesh import WrongMeshSize
 
 UPLOAD = "mesh"  # in the inputs of the job
@@ -52,20 +52,26 @@ class AddingStep:
     faces: int | None = None
 
 
-def add_object_job(params: dict[str, Any], place: JobContext) -> Iterator[AddingStep]:
+class AddObjectParams(JobParams):
+    """The object, and the name of the file that was sent."""
+
+    name: str
+    object: NewObject
+    file_name: str
+
+
+def add_object_job(params: AddObjectParams, place: JobContext) -> Iterator[AddingStep]:
     """Make the uploaded mesh an object; whatever is in it, this process alone may suffer from it.
 
     Raises:
         MeshRefused: if it cannot be used.
         OsfError: if the disk refuses.
     """
-    from osfcore.objects.fetch import NewObject
-
     _bound()
     inputs = place.folder / INPUTS
-    new = NewObject(**params["object"])
+    new = params.object
     try:
-        yield from _added(new, params["file_name"], place)
+        yield from _added(new, params.file_name, place)
     except MemoryError:
         raise MeshRefused("The mesh needs too much memory; simplify it, or make its texture smaller.") from None
     except OsfError as error:
@@ -126,12 +132,4 @@ def _length(metres: float) -> str:
     return f"{1000 * metres:.3g} mm"
 
 
-class AddingParams(Entry):
-    """What the stored making of an object must name."""
-
-    name: Text
-    object: dict[str, Any]
-    file_name: Text
-
-
-ADD_OBJECT = JobKind("add_object", "new object", add_object_job, params=AddingParams)
+ADD_OBJECT = JobKind("add_object", "new object", add_object_job, AddObjectParams)

@@ -9,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from app.jobs.job import INPUTS
 from app.jobs.kind import JobKind
+from app.jobs.params import JobParams
 from osfcore.io.files import write_json
-from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, decode, encode
+from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, encode
 from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
@@ -42,6 +43,26 @@ class PhotoInput(Entry):
     names: list[Text]
 
 
+class PhotoParams(JobParams):
+    """Photographs of one table, the first of which is the one that is looked at.
+
+    Attributes:
+        photo: identifier of the first.
+        title: what it is called.
+        names: of all objects that are marked.
+        seed: of the searches.
+        notes: what a person should know of the first.
+        photos: all of them.
+    """
+
+    photo: str
+    title: str
+    names: tuple[str, ...]
+    seed: int
+    notes: tuple[str, ...]
+    photos: tuple[PhotoInput, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """How far the job is.
@@ -64,7 +85,7 @@ def sheet_name(name: str, choice: int) -> str:
     return f"{name}.{choice}.png"
 
 
-def photo_job(params: dict[str, Any], place: JobContext) -> Iterator[Finding]:
+def photo_job(params: PhotoParams, place: JobContext) -> Iterator[Finding]:
     """Find the objects.
 
     Raises:
@@ -75,18 +96,17 @@ def photo_job(params: dict[str, Any], place: JobContext) -> Iterator[Finding]:
     from osfcore.photo.summary import summarised
 
     yield Finding(0, 0, "Loading fields")
-    names, folder = tuple(params["names"]), place.folder / INPUTS
-    orders = [decode(PhotoInput, order, "photo") for order in params["photos"]]
-    photos = [_photograph(folder, number, order) for number, order in enumerate(orders)]
+    names, folder = params.names, place.folder / INPUTS
+    photos = [_photograph(folder, number, order) for number, order in enumerate(params.photos)]
     fields = FieldLibrary(place.data_dir)
     models = PhotoModels({name: fields.load(name) for name in names})
-    rng = stream_rng(params["seed"], Stream.PHOTO_SEARCH)
+    rng = stream_rng(params.seed, Stream.PHOTO_SEARCH)
     step = None
     for step in estimate_photo(models, photos, names, rng):
         yield Finding(step.progress.done, step.progress.total + 1, step.progress.note, len(step.found))
     assert step is not None
     yield Finding(step.progress.total, step.progress.total + 1, "The lamp", len(step.found))
-    write_json(place.folder / FOUND, encode(summarised(photos, step, models, params["notes"])))
+    write_json(place.folder / FOUND, encode(summarised(photos, step, models, params.notes)))
     for found in step.found:
         if found.name in photos[0].masks:
             _draw_sheets(place.folder, models, photos[0], found)
@@ -120,14 +140,6 @@ def _draw_sheets(folder: Path, models: PhotoModels, photo: Photograph, found: Ph
         write_sheet(folder / sheet_name(found.name, choice), models, photo, replace(found, best=pose))
 
 
-class PhotoParams(Entry):
-    """What a stored look at a photo must name."""
-
-    photo: Text
-    title: Text
-    names: list[Text]
-
-
 PHOTO = JobKind(
-    "photo", "look at a photo", photo_job, params=PhotoParams, preloads=("osfcore.photo.summary",), ends_at_once=True
+    "photo", "look at a photo", photo_job, PhotoParams, preloads=("osfcore.photo.summary",), ends_at_once=True
 )

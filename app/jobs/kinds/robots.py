@@ -12,13 +12,15 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 from urllib.parse import quote
 
 from app.episodes.file_names import CAMERAS_FOLDER, GOAL_FILE, REPORT_FILE, STOPPED
 from app.episodes.progress import EpisodeProgress
+from app.episodes.settings import StoredSettings
 from app.jobs.job import INPUTS, Job
 from app.jobs.kind import JobKind
+from app.jobs.params import JobParams
 from osfcore.contrib.robots.robot import ConnectionLost, SafetyLimits
 from osfcore.errors import OsfError
 from osfcore.estimation.camera_response import srgb_of_linear
@@ -53,7 +55,33 @@ class RobotProgress(EpisodeProgress):
         return self.drives in ("asked", "lost")
 
 
-def robot_job(params: dict[str, Any], place: JobContext) -> Iterator[RobotProgress]:
+class RobotParams(JobParams):
+    """A robot, what it shall do, and how far and fast it may go.
+
+    Attributes:
+        url: of the robot.
+        title: what the goal is called.
+        names: of the objects.
+        goal_camera: the name of the robot's camera that took the goal photo.
+        boxes: by camera and object, its bounding box in the first images [px].
+        seed: of the searches.
+        settings: of the episode.
+        box: least x, least y, greatest x and greatest y of the pusher [m].
+        top_speed_m_s: of the pusher along each axis.
+    """
+
+    url: str
+    title: str
+    names: tuple[str, ...]
+    goal_camera: str
+    boxes: dict[str, dict[str, tuple[float, float, float, float]]]
+    seed: int
+    settings: StoredSettings
+    box: tuple[float, float, float, float]
+    top_speed_m_s: float
+
+
+def robot_job(params: RobotParams, place: JobContext) -> Iterator[RobotProgress]:
     """Run an episode.
 
     Raises:
@@ -105,15 +133,14 @@ def _driven(
             yield progress
 
 
-def _order(params: dict[str, Any], place: JobContext) -> DriveOrder:
+def _order(params: RobotParams, place: JobContext) -> DriveOrder:
     from app.episodes.robot import DriveOrder
-    from app.episodes.settings import ChosenSettings
 
     goal: Path = place.folder / INPUTS / GOAL_FILE
-    limits = SafetyLimits((*params["box"],), params["top_speed_m_s"])  # pyright: ignore[reportArgumentType]
+    limits = SafetyLimits(params.box, params.top_speed_m_s)
     return DriveOrder(
-        params["url"], tuple(params["names"]), goal, place.folder, place.data_dir, params["goal_camera"],
-        boxes=params["boxes"], limits=limits, seed=params["seed"], settings=ChosenSettings.of_job(params).of_loop(),
+        params.url, params.names, goal, place.folder, place.data_dir, params.goal_camera,
+        boxes=params.boxes, limits=limits, seed=params.seed, settings=params.settings.of_loop(),
     )  # fmt: skip
 
 
@@ -134,7 +161,7 @@ def _stopped(job: Job, folder: Path) -> Job:
     return replace(job, result=result)
 
 
-ROBOT = JobKind("robot", "episode with the robot", robot_job, keeps_steps=True, on_broken_off=_stopped)
+ROBOT = JobKind("robot", "episode with the robot", robot_job, RobotParams, keeps_steps=True, on_broken_off=_stopped)
 
 
 # What the robot's cameras saw last, in the job's folder.

@@ -266,7 +266,7 @@ REPORT = {"steps": [STEP], "noticed": [{"step": 0, "matter": "goal", "text": "It
 
 
 def told(job, report=None, files=()):
-    return EpisodeOut.of_job(job, "A box", ChosenSettings.of_job(job.params), report, files)
+    return EpisodeOut.of_job(job, "A box", report, files)
 
 
 def test_only_what_was_said_is_handed_on():
@@ -354,7 +354,7 @@ def test_the_method_is_asked_for_among_the_settings():
 def test_steps_of_a_method_that_looks_at_images_alone_know_no_distances():
     step = {"step": 0, "seconds": {}, "image_cost": 0.1, "to_goal_mm": None, "to_goal_deg": None, "estimate_off_mm": {}}
     job = Job("a", "episode", {**PARAMS, "method": "paper"})
-    out = EpisodeOut.of_job(job, "A", ChosenSettings.of_job(job.params), {"steps": [step]}, ())
+    out = EpisodeOut.of_job(job, "A", {"steps": [step]}, ())
     assert out.settings.method == "paper"
     assert (out.steps[0].to_goal_mm, out.steps[0].to_goal_deg) == (None, None)
 

@@ -1,8 +1,10 @@
 import json
+from dataclasses import asdict
 
 import pytest
 
 from app.episodes.settings import ChosenSettings
+from app.jobs.kinds.episodes import EpisodeParams
 from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput
 from osfcore.paper.mppi import GaussianPlanSettings
@@ -13,8 +15,7 @@ GIVEN = {"steps": 7, "samples": 8, "horizon": 4, "temperature": 0.5, "cost": "im
 
 def test_they_come_back_from_a_job_as_they_were_given():
     chosen = ChosenSettings.defaults().changed(GIVEN)
-    stored = json.loads(json.dumps({"settings": chosen.to_job()}))
-    assert ChosenSettings.of_job(stored) == chosen
+    assert ChosenSettings.of_stored(json.loads(json.dumps(asdict(chosen)))) == chosen
     assert {name: getattr(chosen, name) for name in GIVEN} == GIVEN
 
 
@@ -28,7 +29,9 @@ def test_a_loop_gets_all_of_them():
 @pytest.mark.parametrize("method", ["ours", "paper"])
 def test_jobs_of_earlier_versions_had_those_of_the_plan_by_themselves(method):
     before = {"settings": {"steps": 5, "plan": {"samples": 9}}, "method": method}
-    assert ChosenSettings.of_job(before) == ChosenSettings.defaults(method).changed({"steps": 5, "samples": 9})
+    before |= {"scene": "s", "names": ["box"], "seed": 0, "goal": {"id": None}}
+    expected = ChosenSettings.defaults(method).changed({"steps": 5, "samples": 9})
+    assert EpisodeParams.from_json(before).settings == expected
 
 
 @pytest.mark.parametrize(
@@ -39,12 +42,12 @@ def test_what_is_out_of_range_is_refused(name, value, what):
     with pytest.raises(InvalidInput, check=about(what)):
         ChosenSettings.defaults().changed({name: value})
     with pytest.raises(InvalidInput, check=about(what)):
-        ChosenSettings.of_job({"settings": {name: value}})
+        ChosenSettings.of_stored({name: value})
 
 
 def test_those_of_another_version_are_refused():
     with pytest.raises(TypeError):
-        ChosenSettings.of_job({"settings": {"speed": 3}})
+        ChosenSettings.of_stored({"speed": 3})
 
 
 def test_the_method_as_published_has_its_own_and_no_others():

@@ -5,6 +5,7 @@ import pytest
 
 from app.jobs.job import Job, State, check_file_name, ended, job_fields, job_from_fields
 from app.jobs.kinds import KINDS
+from app.jobs.kinds.collections import CollectPushesParams
 from app.jobs.registry import WrongJobState
 from osfcore.errors import InvalidInput, UnknownName
 from tests.support.errors import about
@@ -41,5 +42,5 @@ def test_orders_that_do_not_fit_say_so():
 @pytest.mark.parametrize("available", [0, 2])
 def test_more_objects_than_there_are_is_refused(available):
     with pytest.raises(InvalidInput, check=about("number of objects")):
-        KINDS["collect_pushes"].check({"objects": 3}, str, available)
-    KINDS["collect_pushes"].check({"objects": 2}, str, 2)
+        KINDS["collect_pushes"].check(CollectPushesParams(objects=3), str, available)
+    KINDS["collect_pushes"].check(CollectPushesParams(objects=2), str, 2)

@@ -21,7 +21,7 @@ from tests.app.conftest import full_disk, newest_child, until
 
 TABLE = ("collect_table", {"images": 60, "size": 16, "seed": 0})
 EPISODE = {"scene": "s1", "names": [], "seed": 0, "settings": {}, "goal": {"id": None}}
-ESTIMATE = {"mode": "first", "names": [], "cameras": [], "of": {"scene": "s1"}}
+ESTIMATE = {"mode": "first", "seed": 0, "names": [], "cameras": [], "of": {"scene": "s1"}}
 LONG = ("collect_table", {"images": 5000, "size": 16, "seed": 0})
 
 

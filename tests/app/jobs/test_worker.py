@@ -22,6 +22,7 @@ from app.jobs.job import Job
 from app.jobs.kind import JobKind
 from app.jobs.kinds import KINDS, KindName, check_stored, in_words
 from app.jobs.loop import after
+from app.jobs.params import JobParams
 from app.jobs.process import JobStopped
 from app.jobs.worker import job_main, run_job
 from app.processes.child_process import launch
@@ -70,7 +71,7 @@ def test_a_refusal_is_told_in_its_words(start):
 
 
 def test_a_defect_is_told_without_a_traceback(start):
-    _, outcome, _, _ = start("collect_table", {"sizes": 3})
+    _, outcome, _, _ = start("juggle", {})
     with pytest.raises(InternalError) as failure:
         outcome.result(60)
     assert "\n" not in str(failure.value)
@@ -186,7 +187,7 @@ def run(monkeypatch, steps, orders=()):
         if isinstance(message, JobRests):
             control.take(ResumeJob())
 
-    monkeypatch.setitem(KINDS, "played", JobKind("played", "play", lambda *_: (step for step in steps)))
+    monkeypatch.setitem(KINDS, "played", JobKind("played", "play", lambda *_: (step for step in steps), JobParams))
     outcome = run_job(RunJob("played", {}, Path("d"), Path("f")), control, send, float("inf"))
     return told, outcome
 
@@ -217,11 +218,14 @@ def test_every_kind_that_can_be_asked_for_has_a_record():
 def test_a_kind_of_job_is_one_record(monkeypatch, tmp_path):
     """What a record says is enough for the service to run such a job and to bring it to its end."""
 
+    class CountParams(JobParams):
+        to: int
+
     def count(params, place):
-        for done in range(1, params["to"] + 1):
+        for done in range(1, params.to + 1):
             yield Told(done, True)
 
-    monkeypatch.setitem(KINDS, "count", JobKind("count", "counting", count, keeps_steps=True))
+    monkeypatch.setitem(KINDS, "count", JobKind("count", "counting", count, CountParams, keeps_steps=True))
     told = []
     outcome = run_job(RunJob("count", {"to": 3}, tmp_path, tmp_path), JobControl(told.append), told.append)
     assert [step.done for step in told] == [1, 2, 3]

@@ -31,7 +31,7 @@ from app.services.episodes import FILES, EpisodeGoesOn, Episodes, GoalUnknown, N
 from app.services.fields import FieldCatalogue, MissingFields, NoPublishedField
 from app.services.goals import GoalRefused, NoTable
 from app.storage.database import CannotStore
-from app.storage.records import GoalRecord, GoalStore, poses_to_json
+from app.storage.records import GoalRecord, GoalStore
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
@@ -45,6 +45,9 @@ from tests.support.errors import about
 POSES = tuple(
     (name, Pose(np.array([x, 0.0, 0.05]), np.array([1.0, 0, 0, 0]))) for name, x in ((BOX, 0), (MUSTARD, 0.2))
 )
+WANTED = [
+    {"name": name, "position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()} for name, pose in POSES
+]
 PNG = encode_png(np.zeros((2, 2, 3), np.uint8))
 
 
@@ -130,7 +133,7 @@ def test_an_episode_toward_a_goal_image_takes_its_own_copy_along(episodes, runne
     )
     goal = job.params["goal"]
     assert (goal["id"], goal["poses"], goal["camera"]["width"]) == ("made", None, 64)
-    assert goal["truth"] == poses_to_json(POSES)
+    assert goal["truth"] == WANTED
     assert job.params["settings"]["samples"] == 8
     goals.remove("made")
     assert (runner.jobs.inputs(job.id) / GOAL_FILE).read_bytes() == PNG
@@ -141,7 +144,7 @@ def test_an_episode_toward_a_goal_image_takes_its_own_copy_along(episodes, runne
 @pytest.mark.slow
 def test_an_episode_toward_poses_knows_where_everything_truly_should_be(episodes, tmp_path):
     goal = episodes.start(chosen(), scene="s", poses=POSES).params["goal"]
-    assert goal == {"id": None, "camera": None, "poses": poses_to_json(POSES), "truth": poses_to_json(POSES)}
+    assert goal == {"id": None, "camera": None, "poses": WANTED, "truth": WANTED}
     assert left_over(tmp_path) == []
 
 
@@ -513,7 +516,7 @@ def test_poses_become_the_image_that_the_method_as_published_wants(episodes, run
     job = episodes.start(chosen(method="paper"), scene="s", poses=POSES)
     assert [(command.id, command.poses) for command in asked] == [("s", POSES)]
     goal = job.params["goal"]
-    assert (goal["id"], goal["poses"], goal["truth"]) == (None, None, poses_to_json(POSES))
+    assert (goal["id"], goal["poses"], goal["truth"]) == (None, None, WANTED)
     assert goal["camera"]["width"] == asked[0].size
     assert (runner.jobs.inputs(job.id) / GOAL_FILE).read_bytes() == PNG
 

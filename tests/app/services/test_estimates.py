@@ -111,10 +111,10 @@ class Runner:
         self.storage = StorageMeter(data_dir)
 
     def submit_job(self, kind, params):
-        return self.jobs.submit(kind, params)
+        return self.jobs.submit(kind, params.to_json())
 
     def submit_with_inputs(self, kind, params, inputs):
-        return self.jobs.submit(kind, params, inputs)
+        return self.jobs.submit(kind, params.to_json(), inputs)
 
 
 @pytest.fixture

@@ -9,7 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from app.episodes.settings import ChosenSettings
 from app.jobs.job import JobChanged
+from app.jobs.kinds.collections import CollectTableParams
+from app.jobs.kinds.episodes import EpisodeGoal, EpisodeParams
+from app.jobs.kinds.fields import FieldSource, TrainFieldParams
 from app.processes.messages.scene_messages import DropScene, SceneChanged, TakeImage
 from app.services.event_hub import CurrentScene, Notice
 from app.services.runner import DemoScene, Runner, SceneNeeded, TrainingAlready
@@ -21,7 +25,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.objects.asset_library import AssetLibrary
 from tests.app.conftest import full_disk, newest_child, until
-from tests.app.jobs.test_registry import LONG, TABLE
+from tests.app.jobs.test_registry import LONG
 from tests.app.storage.test_database import record
 from tests.support.errors import about
 
@@ -231,10 +235,12 @@ def test_a_scene_that_a_live_job_needs_cannot_be_deleted_until_it_is_cancelled(o
 
 def test_a_job_is_not_queued_for_a_scene_that_was_deleted_meanwhile(open_runner):
     runner = open_runner(demo_scene=False)
+    goal, settings = EpisodeGoal(id=None), ChosenSettings.defaults()
+    params = EpisodeParams(scene="gone", names=(BOX,), seed=0, settings=settings, goal=goal)
     with runner.jobs.new_inputs() as folder:
         folder.mkdir(parents=True)
         with pytest.raises(UnknownName, check=about("scene")):
-            runner.submit_with_inputs("episode", {"scene": "gone"}, folder)
+            runner.submit_with_inputs("episode", params, folder)
     assert runner.jobs.all() == ()
 
 
@@ -252,20 +258,20 @@ def test_an_image_is_made_once_for_each_revision(open_runner):
 
 def test_jobs_are_told_to_those_who_listen(open_runner):
     runner = open_runner(demo_scene=False)
-    job = runner.submit_job(*TABLE)
+    job = runner.submit_job("collect_table", CollectTableParams(images=60, size=16))
     until(lambda: runner.jobs.get(job.id).state == "done", 60)
     until(lambda: any(isinstance(e, JobChanged) and e.job.state == "done" for e in runner.events))
 
 
 def test_one_field_is_ordered_once_however_many_ask_at_once(open_runner, monkeypatch):
     runner = open_runner(demo_scene=False)
-    params = {"name": "box", "source": {"mesh": BOX, "set": None}, "minutes": 10, "seed": 0, "images": 5000}
+    params = TrainFieldParams(name="box", source=FieldSource(mesh=BOX), minutes=10, images=5000)
     submit = runner.jobs.submit
     monkeypatch.setattr(runner.jobs, "submit", lambda *order: (time.sleep(0.05), submit(*order))[1])
 
     def order(_):
         try:
-            return runner.submit_job("train_field", dict(params))
+            return runner.submit_job("train_field", params)
         except TrainingAlready:
             return None
 

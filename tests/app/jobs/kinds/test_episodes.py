@@ -18,7 +18,7 @@ from app.episodes.file_names import (
 from app.jobs.context import JobContext, JobControl, RunJob
 from app.jobs.job import INPUTS
 from app.jobs.kinds import KINDS
-from app.jobs.kinds.episodes import EpisodeJobProgress, episode_job
+from app.jobs.kinds.episodes import EpisodeJobProgress, EpisodeParams, episode_job
 from app.jobs.worker import run_job
 from osfcore.control import estimators
 from osfcore.control.events import ActionExecuted, Looking, Observed, Planning, Stepped
@@ -77,12 +77,13 @@ def entries(state):
     ]
 
 
-def params(stage, shift=0.06, settings=SMALL, **goal):  # noqa: F811
+def params(stage, shift=0.06, settings=SMALL, method=None, **goal):  # noqa: F811
     """The gelatin box has to go a little to the left; where it truly should be is known unless it is said otherwise."""
     poses = entries(stage.world.truth())
     poses[1]["position"][0] -= shift
     goal = {"id": None, "camera": None, "poses": poses, "truth": poses} | goal
-    return {"scene": "s1", "names": list(NAMES), "seed": 0, "settings": settings, "goal": goal}
+    given = {"scene": "s1", "names": list(NAMES), "seed": 0, "settings": settings, "goal": goal}
+    return EpisodeParams.from_json(given | ({} if method is None else {"method": method}))
 
 
 def report_of(place):
@@ -131,7 +132,8 @@ def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
     monkeypatch.setitem(
         KINDS, "episode", replace(KINDS["episode"], run=lambda _params, _place: (step for step in steps))
     )
-    run_job(RunJob("episode", {}, place.data_dir, place.folder), JobControl(told.append), told.append)
+    given = {"scene": "s", "names": [], "seed": 0, "settings": {}, "goal": {"id": None}}
+    run_job(RunJob("episode", given, place.data_dir, place.folder), JobControl(told.append), told.append)
     assert told[0].result == {
         "share": 0.5, "left_s": 9.0, "stage": "act", "steps": 1, "seconds": 31.0, "outcome": None, "text": None,
     }  # fmt: skip
@@ -257,7 +259,7 @@ def test_the_method_as_published_goes_through_the_same_job(place, stage, monkeyp
     for name in ("estimate_first", "estimate_next"):
         monkeypatch.setattr(stages, name, found)
     goal = seen_by_the_goal_camera(place, stage)
-    told = list(episode_job(params(stage, settings=FEW, **goal) | {"method": "paper"}, place))
+    told = list(episode_job(params(stage, settings=FEW, method="paper", **goal), place))
     assert list(dict.fromkeys(step.stage for step in told)) == [None, "first", "plan", "act", "next"]
     assert (told[-1].outcome, told[-1].done, told[-1].steps, told[-1].total) == ("out of steps", 1, 2, 1)
     assert sum(isinstance(step.view, PlanSketch) for step in told) == 1
@@ -274,7 +276,7 @@ def test_the_method_as_published_runs_on_its_own(place, stage, monkeypatch):  # 
     little = PaperEstimationConfig(masked_iterations=1, masked_population=8, joint_iterations=2, joint_population=8)
     monkeypatch.setattr(stages, "estimate_first", lambda *given: estimate_first(*given[:3], little))
     goal = seen_by_the_goal_camera(place, stage)
-    *_, last = list(episode_job(params(stage, settings=FEW, truth=None, **goal) | {"method": "paper"}, place))
+    *_, last = list(episode_job(params(stage, settings=FEW, method="paper", truth=None, **goal), place))
     assert (last.outcome, last.done) == ("out of steps", 1)
     report = report_of(place)
     assert {"first", "estimate", "plan"} <= set().union(*(step["seconds"] for step in report["steps"]))

@@ -6,7 +6,16 @@ import pytest
 
 from app.jobs.context import JobContext
 from app.jobs.job import INPUTS
-from app.jobs.kinds.estimates import STATE, STEPS, estimate_job, load_models, read_steps, state_of_step
+from app.jobs.kinds.estimates import (
+    STATE,
+    STEPS,
+    EstimateParams,
+    Source,
+    estimate_job,
+    load_models,
+    read_steps,
+    state_of_step,
+)
 from osfcore.errors import CannotWrite, CorruptFile, UnknownName
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import default_cameras
@@ -20,7 +29,7 @@ from osfcore.random_streams import Stream, stream_rng
 from tests.support.errors import about
 
 MUSTARD = "006_mustard_bottle"
-FIRST = {"mode": "first", "seed": 5}
+FIRST = EstimateParams(mode="first", seed=5, of=Source(scene=None), names=(MUSTARD,), cameras=("0",))
 
 
 def state(x=0.1) -> SceneState:
@@ -96,14 +105,14 @@ def test_the_estimator_gets_the_observation_and_the_prior_but_never_the_truth(pl
     assert asked["others"][0].random() == stream_rng(5, Stream.FIRST_FRAME).random()
     write_estimated(inputs / "prior.json", believed(state(0.07)))
     for mode, count in (("next", 3), ("goal", 1)):
-        list(estimate_job({"mode": mode, "seed": 0}, place))
+        list(estimate_job(FIRST.model_copy(update={"mode": mode}), place))
         assert asked["others"][0].poses.position[0, 0] == 0.07
         assert len(asked["others"]) == count
 
 
 def test_missing_inputs_and_fields_are_told(place, asked):
     with pytest.raises(CorruptFile, check=about("prior.json")):
-        list(estimate_job({"mode": "next", "seed": 0}, place))
+        list(estimate_job(FIRST.model_copy(update={"mode": "next"}), place))
     with pytest.raises(UnknownName, check=about("spoon")):
         load_models(place.data_dir, ("spoon",))
     with pytest.raises(CorruptFile):

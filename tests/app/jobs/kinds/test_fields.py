@@ -10,7 +10,7 @@ from PIL import Image
 import osfcore.fields.train_kiloosf as training
 import osfcore.paper.train_fields as paper_training
 from app.jobs.context import JobContext
-from app.jobs.kinds.fields import COMPARISON, PREVIEW, train_field_job
+from app.jobs.kinds.fields import COMPARISON, PREVIEW, FieldSource, TrainFieldParams, train_field_job
 from app.storage.field_files import workshop
 from osfcore.errors import MissingAssets
 from osfcore.fields.field_library import FieldLibrary
@@ -20,14 +20,12 @@ from osfcore.progress import Progress
 from tests.app.processes.fields import write_box
 
 GELATIN, NAME = "009_gelatin_box", "thing"  # there is a field of the first already
-ORDER = {
-    "name": NAME,
-    "source": {"mesh": GELATIN, "set": None},
-    "minutes": 0.5,
-    "seed": 3,
-    "images": 60,
-    "hollow": False,
-}
+ORDER = TrainFieldParams(name=NAME, source=FieldSource(mesh=GELATIN), minutes=0.5, seed=3, images=60)
+UPLOAD = FieldSource(set="abc")
+
+
+def order(**changes):
+    return ORDER.model_copy(update=changes)
 
 
 @pytest.fixture
@@ -93,7 +91,7 @@ def test_after_a_kill_the_same_order_uses_the_images_that_are_there(place, train
     assert not any("Image" in note for note in notes)
     assert (shop / GELATIN / "train" / "anno.json").stat().st_mtime_ns == kept
     again.close()
-    other = train_field_job({**ORDER, "seed": 4}, place)
+    other = train_field_job(order(seed=4), place)
     next(other)
     assert "Image 1 of 60" in next(other).note
 
@@ -113,7 +111,7 @@ def test_from_a_set_no_mesh_is_needed(place, trained):
     images = place.data_dir / "sets" / "abc" / "images" / "train"
     images.mkdir(parents=True)
     (images / "anno.json").write_text("[]")
-    list(train_field_job({**ORDER, "name": "thing", "source": {"mesh": None, "set": "abc"}}, place))
+    list(train_field_job(order(name="thing", source=UPLOAD), place))
     assert trained[0].data == images.parent
     assert (place.data_dir / "fields" / "thing" / "field.safetensors").is_file()
 
@@ -137,7 +135,7 @@ def test_of_two_fields_the_one_that_is_better_on_the_same_images_stays(place, mo
         yield training.FieldStep(Progress(30, 30, "Done"), 99.0, 99.0, None)
 
     monkeypatch.setattr(training, "train_field", fake)
-    steps = list(train_field_job({**ORDER, "name": GELATIN}, place))
+    steps = list(train_field_job(order(name=GELATIN), place))
     last = steps[-1]
     assert last.in_use is is_better
     assert (last.psnr_mask > last.before_mask + 3) is is_better
@@ -154,7 +152,7 @@ def test_of_two_fields_the_one_that_is_better_on_the_same_images_stays(place, mo
 
 def test_a_mesh_that_is_gone_is_told(place, trained):
     with pytest.raises(MissingAssets):
-        list(train_field_job({**ORDER, "source": {"mesh": "025_mug", "set": None}}, place))
+        list(train_field_job(order(source=FieldSource(mesh="025_mug")), place))
     assert trained == []
 
 
@@ -167,8 +165,8 @@ def test_a_field_as_published_is_kept_beside_ours(place, monkeypatch, weights):
     monkeypatch.setattr(paper_training, "train_paper_field", fake)
     (place.data_dir / "sets" / "s1" / "images").mkdir(parents=True)
     ours = FieldLibrary(place.data_dir).stamp(GELATIN)
-    order = {**ORDER, "name": GELATIN, "source": {"mesh": None, "set": "s1"}, "method": "paper"}
-    *_, last = train_field_job(order, place)
+    published = order(name=GELATIN, source=FieldSource(set="s1"), method="paper")
+    *_, last = train_field_job(published, place)
     assert (last.in_use, last.before_mask, last.psnr_mask) == (True, None, 15.5)
     assert paper_field_path(GELATIN, place.data_dir) == own_field_path(GELATIN, place.data_dir)
     assert own_field_path(GELATIN, place.data_dir).read_bytes() == weights

@@ -21,7 +21,7 @@ class Driven:
         write_png(place / "job" / INPUTS / GOAL_FILE, np.zeros((64, 64, 3), np.uint8))
         self.steps, self.control = [], JobControl(print)
         params = {
-            "url": url, "names": list(NAMES), "goal_camera": "0", "boxes": {}, "seed": 0,
+            "url": url, "title": "Goal", "names": list(NAMES), "goal_camera": "0", "boxes": {}, "seed": 0,
             "box": (-0.35, -0.35, 0.35, 0.35), "top_speed_m_s": 0.4,
             "settings": {"steps": 2, "plan": {"samples": 16, "horizon": 6}}, **more,
         }  # fmt: skip
