@@ -85,9 +85,10 @@ class ViewerDriver:
     def drag(self, path, position=None, turn=None, *phases):
         """Move the handles of a node."""
         handles = self.node(path)
-        handles.position = np.array(handles.position if position is None else position, float)
-        handles.wxyz = np.array(handles.wxyz if turn is None else turn, float)
         for phase in phases or ("start", "update", "end"):
+            if phase != "start":  # a hand takes hold of them before it moves them
+                handles.position = np.array(handles.position if position is None else position, float)
+                handles.wxyz = np.array(handles.wxyz if turn is None else turn, float)
             for callback in handles._impl_aux.update_cb:
                 asyncio.run(callback(SimpleNamespace(client=self.client, target=handles, phase=phase)))
 
