@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 
 from app.processes.messages.scene_messages import Disturb, EditScene, SceneRecord
-from app.processes.sim_process import Disturbance
 from app.services.scenes import Scenes
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects
 from osfcore.geometry.cameras import default_cameras
@@ -79,16 +78,16 @@ class Disturber:
     def _nudge(self, record: SceneRecord) -> tuple[SceneRecord, str]:
         state = record.state
         # Those at the pusher last: what happens to them could be its doing, so that nothing of it is told.
-        names = sorted(self._rng.permutation(state.names), key=lambda name: self._is_at_pusher(state, str(name)))
-        for name in names:
-            pose = state.pose(str(name))
+        shuffled = [str(name) for name in self._rng.permutation(state.names)]
+        for name in sorted(shuffled, key=lambda name: self._is_at_pusher(state, name)):
+            pose = state.pose(name)
             for _ in range(_PLACES):
                 angle, length = self._rng.uniform(-np.pi, np.pi), self._rng.uniform(*_NUDGE_M)
                 place = pose.position + length * np.array([np.cos(angle), np.sin(angle), 0.0])
                 if np.abs(place[:2]).max() > WORKSPACE_HALF_M:
                     continue
                 try:
-                    poses = ((str(name), Pose(place, pose.quaternion)),)
+                    poses = ((name, Pose(place, pose.quaternion)),)
                     moved = self._scenes.disturb(EditScene(record.id, poses=poses, settle=True))
                 except (OverlappingObjects, InvalidInput):
                     continue
@@ -101,14 +100,12 @@ class Disturber:
         return here is not None and bool(np.linalg.norm(state.pose(name).position[:2] - here[:2]) < _AT_PUSHER_M)
 
     def _dim(self, record: SceneRecord) -> tuple[SceneRecord, str]:
-        brightness = self._toggle(record.id, None).brightness
+        brightness = self._scenes.disturb(Disturb(record.id, None)).brightness
         text = f"The light was dimmed to {100 * brightness:.0f} %." if brightness != 1.0 else "The light is as it was."
         return self._scenes.get(record.id), text
 
     def _cover(self, record: SceneRecord) -> tuple[SceneRecord, str]:
-        covered = self._toggle(record.id, str(self._rng.choice([camera.name for camera in default_cameras()]))).covered
+        camera = str(self._rng.choice([camera.name for camera in default_cameras()]))
+        covered = self._scenes.disturb(Disturb(record.id, camera)).covered
         text = "".join(f"Camera {name} is covered." for name in covered) or "No camera is covered now."
         return self._scenes.get(record.id), text
-
-    def _toggle(self, scene: str, camera: str | None) -> Disturbance:
-        return self._scenes.disturb(Disturb(scene, camera))

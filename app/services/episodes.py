@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shutil
 import threading
 import zipfile
 from collections.abc import Mapping
@@ -30,13 +29,13 @@ from app.episodes.settings import ChosenSettings
 from app.jobs.job import Job, JobPage
 from app.jobs.kinds.clips import ClipParams
 from app.jobs.kinds.episodes import EpisodeGoal, EpisodeParams
-from app.processes.messages.scene_messages import ComposeGoal
+from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
 from app.services.examples import Stories
 from app.services.fields import FieldCatalogue
 from app.services.goals import GOAL_SIDE, GoalChecks, Goals, NoTable
-from app.services.runner import Runner
-from app.storage.database import CannotStore
-from app.storage.records import Poses
+from app.services.runner import Runner, fill_inputs
+from app.services.scenes import scene_or_current
+from app.storage.records import GoalRecord, Poses
 from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed, shown
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import unit_quaternion
@@ -96,11 +95,8 @@ class Episodes:
     """
 
     def __init__(self, runner: Runner, fields: FieldCatalogue, goals: Goals, checks: GoalChecks) -> None:
-        self._runner = runner
+        self._runner, self._fields, self._goals, self._checks = runner, fields, goals, checks
         self._making = threading.Lock()  # of files on demand
-        self._fields = fields
-        self._goals = goals
-        self._checks = checks
 
     # Asking for one
 
@@ -131,16 +127,15 @@ class Episodes:
             StorageFull: if nothing more may be written.
         """
         check_seed(seed)
-        scene = scene or self._runner.scenes.current
-        if scene is None:
-            raise NoTable
-        names = self._runner.scenes.get(scene).state.names
+        table = scene_or_current(self._runner.scenes, scene, NoTable)
+        names = table.state.names
         self._fields.require(names, settings.method)
         if goal is not None and poses is None and not settings.despite_doubts:
-            self._checks.require(goal, scene)
+            self._checks.require(goal, table.id)
+        kept = None if goal is None else self._goals.get(goal)
         with self._runner.jobs.new_inputs() as folder:
-            title, wanted = self._new_name(goal, names), self._goal(goal, poses, settings.method, scene, names, folder)
-            params = EpisodeParams(scene=scene, title=title, names=names, seed=seed, settings=settings, goal=wanted)
+            title, wanted = self._new_name(kept, names), self._goal(kept, poses, settings.method, table, folder)
+            params = EpisodeParams(scene=table.id, title=title, names=names, seed=seed, settings=settings, goal=wanted)
             job = self._runner.submit_with_inputs(KIND, params, folder)
         self._goals.drop_draft()  # what is composed cannot be moved while the episode has the scene
         return job
@@ -160,41 +155,31 @@ class Episodes:
         return self._runner.jobs.change(job.id, {"settings": asdict(now.changed(settings))})
 
     def _goal(
-        self, goal_id: str | None, poses: Poses | None, method: Method, scene: str, names: tuple[str, ...], folder: Path
+        self, goal: GoalRecord | None, poses: Poses | None, method: Method, table: SceneRecord, folder: Path
     ) -> EpisodeGoal:
         """Return what the job is given of the goal; a goal image is copied for it."""
-        if (goal_id is None) == (poses is None):
+        if (goal is None) == (poses is None):
             raise NoGoal
-        try:
-            folder.mkdir(parents=True)
-            if goal_id is None:
-                given = _of_all(poses or (), names)
-                if method == "paper":
-                    return self._rendered(given, scene, folder)
-                wanted = _entries(given)
-                return EpisodeGoal(id=None, poses=wanted, truth=wanted)
-            goal = self._goals.get(goal_id)
-            shutil.copyfile(self._goals.image(goal.id), folder / GOAL_FILE)
-            prepared = None if goal.example is None or goal.scene != scene else Stories().prepared(goal.example)
+        names = table.state.names
+        files: dict[str, Path] = {}
+        if goal is not None:
+            poses = goal.poses
+            files[GOAL_FILE] = self._goals.image(goal.id)
+            prepared = None if goal.example is None or goal.scene != table.id else Stories().prepared(goal.example)
             if prepared is not None:
-                shutil.copyfile(prepared, folder / PREPARED_FILE)
-        except OSError as error:
-            raise CannotStore(folder, error.strerror or str(error)) from error
-        if goal.source == "photo" and goal.poses is not None:  # nothing is left to be read from its image
-            given = _of_all(goal.poses, names)
-            if method == "paper":
-                return self._rendered(given, scene, folder).model_copy(update={"id": goal.id})
-            found = _entries(given)
-            return EpisodeGoal(id=goal.id, camera=CameraJson.of(goal.camera), poses=found, truth=found)
-        is_known = goal.poses is not None and goal.scene == scene and {name for name, _ in goal.poses} == set(names)
-        truth = _entries(goal.poses) if is_known and goal.poses is not None else None
-        return EpisodeGoal(id=goal.id, camera=CameraJson.of(goal.camera), truth=truth)
-
-    def _rendered(self, poses: Poses, scene: str, folder: Path) -> EpisodeGoal:
-        """A goal that was given as poses, as the image that a method wants which knows of nothing else."""
-        made = self._runner.scenes.compose(ComposeGoal(scene, poses, size=GOAL_SIDE))
-        write_atomically(folder / GOAL_FILE, made.png)
-        return EpisodeGoal(id=None, camera=CameraJson.of(goal_camera(GOAL_SIDE)), truth=_entries(made.poses))
+                files[PREPARED_FILE] = prepared
+        fill_inputs(folder, files)
+        identifier, camera = (None, None) if goal is None else (goal.id, CameraJson.of(goal.camera))
+        if goal is not None and (goal.source != "photo" or poses is None):  # the job reads them from the image
+            is_known = goal.scene == table.id and {name for name, _ in poses or ()} == set(names)
+            return EpisodeGoal(id=identifier, camera=camera, truth=_entries(poses or ()) if is_known else None)
+        given = _of_all(poses or (), names)
+        if method == "paper":  # which knows of nothing else than an image
+            made = self._runner.scenes.compose(ComposeGoal(table.id, given, size=GOAL_SIDE))
+            write_atomically(folder / GOAL_FILE, made.png)
+            camera, truth = CameraJson.of(goal_camera(GOAL_SIDE)), _entries(made.poses)
+            return EpisodeGoal(id=identifier, camera=camera, truth=truth)
+        return EpisodeGoal(id=identifier, camera=camera, poses=_entries(given), truth=_entries(given))
 
     def make_clip(self, job: Job) -> Job:
         """Queue the job that makes a clip of an episode; the one that is at it already, if there is one.
@@ -254,9 +239,8 @@ class Episodes:
             raise InvalidInput("name", "empty", "some letters")
         return self._runner.jobs.rename(job.id, name.strip())
 
-    def _new_name(self, goal_id: str | None, names: tuple[str, ...]) -> str:
+    def _new_name(self, goal: GoalRecord | None, names: tuple[str, ...]) -> str:
         """That of the goal, or of the objects; with a number if there is one of that name already."""
-        goal = None if goal_id is None else self._goals.get(goal_id)
         name = ", ".join(map(self._runner.library.label, names)) if goal is None else goal.name
         taken = {self.name(job) for job in self._runner.jobs.page(_MOST_NAMES, None, KIND).jobs}
         numbered = itertools.chain([name], (f"{name} {n}" for n in itertools.count(2)))
@@ -325,10 +309,11 @@ class Episodes:
             UnknownName: if there is no frame yet.
             CorruptFile: if it is damaged.
         """
-        count = len(list((self._folder(job) / FRAMES_FOLDER).glob("[0-9]*.png")))
+        frames = self._folder(job) / FRAMES_FOLDER
+        count = len(list(frames.glob("[0-9]*.png")))
         if not count:
             raise UnknownName("picture", at, ["none yet"])
-        whole = read_frame(self._folder(job) / FRAMES_FOLDER / f"{count - 1 if at == 'end' else 0:03d}.png")
+        whole = read_frame(frames / f"{count - 1 if at == 'end' else 0:03d}.png")
         return encode_png(cv2.resize(part_of(whole, "now"), (THUMBNAIL_PX,) * 2, interpolation=cv2.INTER_AREA))
 
     def files(self, job: Job) -> tuple[str, ...]:
@@ -353,9 +338,21 @@ class Episodes:
             return self._made(job, name)
 
     def _made(self, job: Job, name: str) -> Path:
+        """Where a file is; made if the episode has not left it, as one that was broken off, or if it is outdated."""
         path = self._folder(job) / name
-        if not path.is_file() or (name == ARCHIVE_FILE and self._is_outdated(job, path)):
-            self._make(job, path)
+        if path.is_file() and not (name == ARCHIVE_FILE and self._is_outdated(job, path)):
+            return path
+        if name == ARCHIVE_FILE:
+            files = [self._made(job, other) for other in self.files(job) if other != ARCHIVE_FILE]
+            with file_at_once(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+                for file in files:
+                    archive.write(file, file.name)
+        elif name == VIDEO_FILE:
+            write_video(path, read_frames(path.parent / FRAMES_FOLDER))
+        else:
+            from app.episodes.recording import write_recording
+
+            write_recording(path, self._runner.library, read_json(path.with_name(REPORT_FILE), _as_states))
         return path
 
     def _is_outdated(self, job: Job, archive: Path) -> bool:
@@ -363,19 +360,6 @@ class Episodes:
         made_at = archive.stat().st_mtime_ns
         files = (self._folder(job) / name for name in self.files(job))
         return any(file.is_file() and file.stat().st_mtime_ns > made_at for file in files)
-
-    def _make(self, job: Job, path: Path) -> None:
-        """What an episode has not left itself: all in one, or video and recording of one that was broken off."""
-        if path.name == ARCHIVE_FILE:
-            _pack(path, [self._made(job, name) for name in self.files(job) if name != ARCHIVE_FILE])
-            return
-        if path.name == VIDEO_FILE:
-            write_video(path, read_frames(path.parent / FRAMES_FOLDER))
-            return
-        from app.episodes.recording import write_recording
-
-        states = read_json(path.with_name(REPORT_FILE), _as_states)
-        write_recording(path, self._runner.library, states)
 
     def _folder(self, job: Job) -> Path:
         return self._runner.jobs.folder(job.id)
@@ -392,13 +376,6 @@ def _of_all(poses: Poses, names: tuple[str, ...]) -> Poses:
 
 def _entries(poses: Poses) -> tuple[ObjectJson, ...]:
     return tuple(ObjectJson.of(name, pose) for name, pose in poses)
-
-
-def _pack(path: Path, files: list[Path]) -> None:
-    """Put files into a zip, which takes its name only when it is whole."""
-    with file_at_once(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in files:
-            archive.write(file, file.name)
 
 
 class _Step(Entry):

@@ -32,11 +32,12 @@ from app.jobs.kinds.estimates import (
 from app.processes.messages.neural_messages import CompareView
 from app.services.fields import FieldCatalogue
 from app.services.runner import Runner
+from app.services.scenes import scene_or_current
 from app.storage.uploads import Examiner, save
-from osfcore.errors import CannotWrite, InvalidInput, OsfError, UnknownName, check_seed
+from osfcore.errors import InvalidInput, OsfError, UnknownName, check_known, check_seed
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import EstimatedState, SceneState
-from osfcore.io.files import read_json, write_json
+from osfcore.io.files import read_json, write_json, writing
 from osfcore.io.json_codec import decode
 from osfcore.io.observation_file import OBSERVATION_FILE, ObservationJson, write_observation
 from osfcore.io.scene_file import EstimateJson, read_estimated, read_scene, state_to_json, write_estimated
@@ -121,15 +122,12 @@ class Estimates:
             QueueFull: if too many jobs wait.
         """
         asked.check()
-        scene = scene or self._runner.scenes.current
-        if scene is None:
-            raise NoScene
-        names = self._runner.scenes.get(scene).state.names
+        table = scene_or_current(self._runner.scenes, scene, NoScene)
+        scene, names = table.id, table.state.names
         self._fields.require(names, asked.method)
         prior = None if asked.mode == "first" else self._prior(asked, names, scene)
         with self._runner.jobs.new_inputs() as folder:
-            is_goal = asked.mode == "goal"
-            seen = self._runner.scenes.observe(scene, goal=is_goal, masks=asked.mode == "first")
+            seen = self._runner.scenes.observe(scene, goal=asked.mode == "goal", masks=asked.mode == "first")
             write_observation(folder / OBSERVATION, seen.observation)
             write_json(folder / TRUTH, state_to_json(seen.record.state))
             if prior is not None:
@@ -160,12 +158,15 @@ class Estimates:
             return await run_in_threadpool(self._of_examined, asked, uploaded, folder, file_name)
 
     def _of_examined(self, asked: Asked, uploaded: Uploaded, folder: Path, file_name: str) -> Job:
-        known = self._fields.names()
-        for name in uploaded.names:
-            if name not in known:
-                raise UnknownName("field", name, known)
+        """Queue an estimate of an upload; what the estimator would refuse is refused at once."""
+        check_known("field", uploaded.names, self._fields.names())
         self._fields.require(uploaded.names, asked.method)
-        check_fits(asked.mode, uploaded)
+        if asked.mode == "first" and not uploaded.has_masks:
+            raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
+        if asked.mode == "first" and uploaded.unseen:
+            raise InvalidInput(f"mask of {uploaded.unseen[0]}", "empty in every view", "not empty in at least one view")
+        if asked.mode == "goal" and len(uploaded.cameras) != 1:
+            raise InvalidInput("number of views of a goal", len(uploaded.cameras), "1")
         if asked.mode != "first" and not (uploaded.has_prior and asked.prior is None):
             write_estimated(folder / PRIOR, self._prior(asked, uploaded.names, None))
         of = Source(scene=None, file_name=file_name)
@@ -270,15 +271,12 @@ class Estimates:
         folder = self._runner.jobs.inputs(job.id) / OBSERVATION
         if not folder.is_dir():
             raise NoImages(f"it was {job.state}" if job.state == "cancelled" else f"it has {job.state}")
-        observation = _observation(folder)
+        file = folder / OBSERVATION_FILE
+        observation = read_json(file, lambda data: decode(ObservationJson, data, "observation"))
         return observation.cameras[view].camera(), folder / observation.images[names[view]]
 
     def _state(self, job: Job) -> EstimatedState:
         return read_estimated(self._runner.jobs.folder(job.id) / STATE)
-
-
-def _observation(folder: Path) -> ObservationJson:
-    return read_json(folder / OBSERVATION_FILE, lambda data: decode(ObservationJson, data, "observation"))
 
 
 def errors_of(estimate: SceneState, truth: SceneState, library: AssetLibrary) -> dict[str, Any]:
@@ -339,23 +337,17 @@ def examine(folder: Path) -> Uploaded:
     place = unpack_observation(folder / ARCHIVE, folder / OBSERVATION)
     (folder / ARCHIVE).unlink()
     observation = read_observation(place)
-    unseen = (
-        ()
-        if observation.masks is None
-        else tuple(n for i, n in enumerate(observation.names) if not observation.masks[:, i].any())
-    )
+    names, masks = observation.names, observation.masks
+    unseen = () if masks is None else tuple(name for i, name in enumerate(names) if not masks[:, i].any())
     has_prior = (place / PRIOR).is_file()
     if has_prior:
         prior = read_estimated(place / PRIOR)
-        if set(prior.state.names) != set(observation.names):
-            raise InvalidInput("objects of prior.json", ", ".join(prior.state.names), ", ".join(observation.names))
-        try:
+        if set(prior.state.names) != set(names):
+            raise InvalidInput("objects of prior.json", ", ".join(prior.state.names), ", ".join(names))
+        with writing(folder):
             (place / PRIOR).rename(folder / PRIOR)
-        except OSError as error:
-            raise CannotWrite(folder, error.strerror or str(error)) from error
-    return Uploaded(
-        observation.names, tuple(c.name for c in observation.cameras), observation.masks is not None, unseen, has_prior
-    )
+    cameras = tuple(camera.name for camera in observation.cameras)
+    return Uploaded(names, cameras, masks is not None, unseen, has_prior)
 
 
 def names_for_people(folder: Path) -> dict[str, str]:
@@ -365,13 +357,3 @@ def names_for_people(folder: Path) -> dict[str, str]:
         f"{folder / OBSERVATION}/": "",
         f"{folder / OBSERVATION}": "The uploaded observation",
     }
-
-
-def check_fits(mode: Mode, uploaded: Uploaded) -> None:
-    """Refuse at once what the estimator would refuse."""
-    if mode == "first" and not uploaded.has_masks:
-        raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
-    if mode == "first" and uploaded.unseen:
-        raise InvalidInput(f"mask of {uploaded.unseen[0]}", "empty in every view", "not empty in at least one view")
-    if mode == "goal" and len(uploaded.cameras) != 1:
-        raise InvalidInput("number of views of a goal", len(uploaded.cameras), "1")

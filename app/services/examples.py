@@ -13,7 +13,7 @@ import numpy as np
 from app.episodes.file_names import PREPARED_FILE, TRAJECTORY_FILE
 from app.processes.messages.scene_messages import SceneRecord
 from app.services.goals import Goals
-from app.services.runner import Runner, SceneNeeded
+from app.services.runner import Runner
 from app.storage.paths import static_folder
 from app.storage.records import GoalRecord
 from osfcore.errors import OsfError, UnknownName
@@ -48,7 +48,7 @@ class Preset:
     azimuth_deg: float
     elevation_deg: float
     shifts_m: Mapping[str, tuple[float, float]]
-    goal_angles_deg: tuple[float, float] | None = field(default=None)
+    goal_angles_deg: tuple[float, float] | None = None
 
     @property
     def light(self) -> Light:
@@ -113,8 +113,10 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
     """
     for made in goals.all():
         if made.example == chosen.id and made.scene:
-            with contextlib.suppress(OsfError):  # in use, or deleted: then another one
-                return _put_back(made.scene, runner), made
+            with contextlib.suppress(OsfError):  # held, or deleted: then another one
+                if runner.jobs.needs(made.scene) is None:
+                    runner.scenes.reset(made.scene)
+                    return runner.scenes.activate(made.scene), made
     # Shown when all is there: the pages ask for its images then, and the goal's would wait behind them.
     there = _untouched(chosen, runner)
     scene = there or runner.scenes.create(names=chosen.objects, seed=chosen.seed, light=chosen.light, is_shown=False)
@@ -126,13 +128,6 @@ def set_up(chosen: Preset, runner: Runner, goals: Goals) -> tuple[SceneRecord, G
             runner.delete_scene(scene.id)
         raise
     return runner.scenes.activate(scene.id), goal
-
-
-def _put_back(scene: str, runner: Runner) -> SceneRecord:
-    if (job := runner.jobs.needs(scene)) is not None:
-        raise SceneNeeded(job)
-    runner.scenes.reset(scene)
-    return runner.scenes.activate(scene)
 
 
 def _untouched(chosen: Preset, runner: Runner) -> SceneRecord | None:

@@ -46,8 +46,8 @@ class NoPublishedField(OsfError):
         )
 
 
-class FieldCatalogue:
-    """Reads and deletes fields.
+class FieldCatalogue(FieldLibrary):
+    """The fields of this machine, those as published, and how they come and go.
 
     Args:
         data_dir: of the service.
@@ -55,20 +55,16 @@ class FieldCatalogue:
     """
 
     def __init__(self, data_dir: Path, meshes: Callable[[], Collection[str]]) -> None:
-        self._data_dir, self._library = data_dir, FieldLibrary(data_dir)
-        self._meshes = meshes
+        super().__init__(data_dir)
+        self._data_dir, self._meshes = data_dir, meshes
 
     def all(self) -> tuple[FieldInfo, ...]:
         """All fields that can be told about, sorted by name."""
         infos = []
-        for name in self._library.names():
+        for name in self.names():
             with contextlib.suppress(OsfError, OSError):  # one that is being deleted must not hide the others
-                infos.append(self._library.info(name))
+                infos.append(self.info(name))
         return tuple(infos)
-
-    def names(self) -> tuple[str, ...]:
-        """Objects with a field."""
-        return self._library.names()
 
     def published(self) -> tuple[str, ...]:
         """Objects with a field as published."""
@@ -92,17 +88,13 @@ class FieldCatalogue:
         if method == "paper" and (missing := sorted(set(names) - set(self.published()))):
             raise NoPublishedField(missing)
 
-    def stamp(self, name: str) -> object:
-        """Changes with the field."""
-        return self._library.stamp(name)
-
     def get(self, name: str) -> FieldInfo:
         """One field.
 
         Raises:
             UnknownName: if there is none.
         """
-        return self._library.info(name)
+        return self.info(name)
 
     def has_mesh(self, name: str) -> bool:
         """Whether scenes can simulate the object."""
@@ -121,7 +113,7 @@ class FieldCatalogue:
                     shutil.copyfile(made / f"{name}{Path(file).suffix}", Path(folder) / file)
             except OSError as error:
                 raise NoTrainedField(name) from error
-            install(Path(folder), self._library.folder(name))
+            install(Path(folder), self.folder(name))
 
     def remove(self, name: str) -> None:
         """Delete a field that was trained here; a shipped one of the same name then counts again.
@@ -131,9 +123,9 @@ class FieldCatalogue:
             ShippedField: if it was not trained here.
             CannotWrite: if that is not allowed.
         """
-        if self._library.info(name).source != "trained":
+        if self.info(name).source != "trained":
             raise ShippedField(name)
-        uninstall(self._library.folder(name))
+        uninstall(self.folder(name))
 
     def remove_published(self, name: str) -> None:
         """Delete a field as published that was trained here; a shipped one of the same name then counts again.

@@ -16,14 +16,14 @@ from PIL import Image
 
 from app.processes.client import ProcessClient, ProcessUnavailable
 from app.processes.messages.neural_messages import CheckPhoto
-from app.processes.messages.scene_messages import ComposedGoal, ComposeGoal, SceneRecord
+from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.runner import Runner
-from app.services.scenes import Scenes
+from app.services.scenes import Scenes, scene_or_current
 from app.storage.database import now_utc
 from app.storage.photos import Photo, PhotoCrop, PhotoReader, central_crop, check_crop, cut_out
-from app.storage.records import Damaged, GoalRecord, GoalStore, PhotoRecord, Poses, Source
-from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName
+from app.storage.records import GoalRecord, GoalStore, PhotoRecord, Poses, Source
+from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName, check_known
 from osfcore.estimation.steps import ContentCheck, Verdict
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
@@ -33,7 +33,6 @@ from osfcore.io.files import reading_png
 
 
 GOAL_SIDE = 256  # of images that are made here [px]
-_MISPLACED = (OverlappingObjects, InvalidInput)  # what a hand can do wrong while it composes
 
 
 class NoDraft(OsfError):
@@ -90,7 +89,7 @@ class GoalsChanged:
     """The list of goals is another one now."""
 
 
-class Goals:
+class Goals(GoalStore):
     """The goals of one service. Methods that change something block; any thread may call.
 
     Args:
@@ -101,52 +100,22 @@ class Goals:
     """
 
     def __init__(self, runner: Runner, data_dir: Path, max_goals: int, photos: PhotoReader) -> None:
-        self._runner = runner
-        self._store = GoalStore(data_dir / "goals", max_goals)
-        self._photos = photos
+        super().__init__(data_dir / "goals", max_goals)
+        self._runner, self._photos = runner, photos
         self._drafting = threading.RLock()
         self._draft: Draft | None = None
         self._draft_png = b""
 
-    def start(self) -> None:
-        """Remove what an earlier service left half done."""
-        self._store.start()
-
     # Goals that are kept
 
-    def all(self) -> tuple[GoalRecord, ...]:
-        """All goals, newest first."""
-        return self._store.all()
-
-    def damaged(self) -> tuple[Damaged, ...]:
-        """Goals that can only be deleted."""
-        return self._store.damaged()
-
-    def get(self, goal: str) -> GoalRecord:
-        """One goal.
-
-        Raises:
-            UnknownName: if there is none.
-            CorruptFile: if it is damaged.
-        """
-        return self._store.get(goal)
-
-    def image(self, goal: str) -> Path:
-        """The image of a goal that exists."""
-        return self._store.image(goal)
-
-    def photo(self, goal: str) -> Path:
-        """The photo that a goal that exists was cut out of; it may have none."""
-        return self._store.photo(goal)
-
-    def remove(self, goal: str) -> None:
+    def remove(self, name: str) -> None:
         """Delete a goal, damaged or not.
 
         Raises:
             UnknownName: if there is none.
             CannotStore: if that is not allowed.
         """
-        self._store.remove(goal)
+        super().remove(name)
         self._runner.storage.outdate()
         self._runner.hub.publish(GoalsChanged())
 
@@ -168,9 +137,9 @@ class Goals:
         camera = camera or goal_camera()
         crop = central_crop(photo.width, photo.height, camera)
         pixels = cut_out(photo, crop, camera)
-        kept = PhotoRecord(photo.width, photo.height, crop)
         seen_by = camera.resized(pixels.shape[1], pixels.shape[0])
-        return self._keep("upload", name, None, seen_by, None, _encoded(pixels, "PNG"), photo=(kept, photo))
+        whole = PhotoRecord(photo.width, photo.height, crop), _encoded(photo.pixels, "JPEG", quality=95)
+        return self._keep_new("upload", name, None, seen_by, None, _encoded(pixels, "PNG"), photo=whole)
 
     def crop(self, goal: str, crop: PhotoCrop) -> GoalRecord:
         """Cut another part out of the photo of a goal.
@@ -192,7 +161,7 @@ class Goals:
             pixels = cut_out(Photo(np.asarray(image.convert("RGB")), *size), crop, record.camera)
         camera = record.camera.resized(pixels.shape[1], pixels.shape[0])
         record = replace(record, camera=camera, photo=PhotoRecord(*size, crop))
-        self._store.replace(record, _encoded(pixels, "PNG"))
+        self.replace(record, _encoded(pixels, "PNG"))
         self._runner.hub.publish(GoalsChanged())
         return record
 
@@ -238,13 +207,13 @@ class Goals:
 
     def keep_photographed(self, name: str, scene: str, camera: Camera, poses: Poses, png: bytes) -> GoalRecord:
         """Keep a layout that was found in a photograph, with that as its image; raises as `receive`."""
-        return self._keep("photo", name, scene, camera, poses, png)
+        return self._keep_new("photo", name, scene, camera, poses, png)
 
     def _made(self, source: Source, command: ComposeGoal, name: str, example: str | None = None) -> GoalRecord:
         made = self._runner.scenes.compose(command)
-        return self._keep(source, name, command.id, goal_camera(GOAL_SIDE), made.poses, made.png, example)
+        return self._keep_new(source, name, command.id, goal_camera(GOAL_SIDE), made.poses, made.png, example)
 
-    def _keep(
+    def _keep_new(
         self,
         source: Source,
         name: str,
@@ -253,20 +222,17 @@ class Goals:
         poses: Poses | None,
         png: bytes,
         example: str | None = None,
-        photo: tuple[PhotoRecord, Photo] | None = None,
+        photo: tuple[PhotoRecord, bytes] | None = None,
     ) -> GoalRecord:
         self._runner.storage.check_room()
-        facts, whole = (None, None) if photo is None else photo
+        facts, jpeg = (None, None) if photo is None else photo
         record = GoalRecord(uuid.uuid4().hex[:12], name, now_utc(), source, scene, camera, poses, example, facts)
-        self._store.keep(record, png, None if whole is None else _encoded(whole.pixels, "JPEG", quality=95))
+        self.keep(record, png, jpeg)
         self._runner.hub.publish(GoalsChanged())
         return record
 
     def _scene(self, scene: str | None) -> str:
-        scene = scene or self._runner.scenes.current
-        if scene is None:
-            raise NoTable
-        return self._runner.scenes.get(scene).id
+        return scene_or_current(self._runner.scenes, scene, NoTable).id
 
     # The one that is being composed
 
@@ -285,7 +251,7 @@ class Goals:
         with self._drafting:
             scene = self._scene(scene)
             made = self._runner.scenes.compose(ComposeGoal(scene, size=GOAL_SIDE))
-            return self._set_draft(Draft(scene, made.poses, revision=self._next_revision()), made)
+            return self._set_draft(scene, made.poses, png=made.png)
 
     def move_draft(self, poses: Poses) -> Draft:
         """Put objects of the draft elsewhere; where they cannot be, the draft says so.
@@ -297,18 +263,14 @@ class Goals:
         """
         with self._drafting:
             draft = self._require_draft()
-            placed = dict(draft.poses)
-            for name, pose in poses:
-                if name not in placed:
-                    raise UnknownName("object of the draft", name, placed)
-                placed[name] = pose
-            laid = tuple(placed.items())
-            number = self._next_revision()
+            before, moved = dict(draft.poses), dict(poses)
+            check_known("object of the draft", moved, before)
+            laid = tuple((before | moved).items())
             try:
                 made = self._runner.scenes.compose(ComposeGoal(draft.scene, laid, size=GOAL_SIDE))
-            except _MISPLACED as error:
-                return self._set_draft(Draft(draft.scene, laid, str(error), number), None)
-            return self._set_draft(Draft(draft.scene, made.poses, "", number), made)
+            except (OverlappingObjects, InvalidInput) as error:  # what a hand can do wrong while it composes
+                return self._set_draft(draft.scene, laid, problem=str(error))
+            return self._set_draft(draft.scene, made.poses, png=made.png)
 
     def draft_image(self) -> bytes:
         """PNG of what the goal camera would see; while there is a problem, the last one without.
@@ -332,7 +294,7 @@ class Goals:
             if draft.problem:
                 raise DraftUnsound(f"This cannot be a goal yet. {draft.problem}")
             camera = goal_camera(GOAL_SIDE)
-            record = self._keep("composed", name, draft.scene, camera, draft.poses, self._draft_png)
+            record = self._keep_new("composed", name, draft.scene, camera, draft.poses, self._draft_png)
             self.drop_draft()
             return record
 
@@ -343,20 +305,18 @@ class Goals:
                 self._draft = None
                 self._runner.hub.publish(DraftChanged(None))
 
-    def _set_draft(self, draft: Draft, made: ComposedGoal | None) -> Draft:
-        self._draft = draft
-        if made is not None:
-            self._draft_png = made.png
-        self._runner.hub.publish(DraftChanged(draft))
-        return draft
+    def _set_draft(self, scene: str, poses: Poses, *, problem: str = "", png: bytes | None = None) -> Draft:
+        revision = 1 if self._draft is None else self._draft.revision + 1
+        self._draft = Draft(scene, poses, problem, revision)
+        if png is not None:
+            self._draft_png = png
+        self._runner.hub.publish(DraftChanged(self._draft))
+        return self._draft
 
     def _require_draft(self) -> Draft:
         if self._draft is None:
             raise NoDraft
         return self._draft
-
-    def _next_revision(self) -> int:
-        return 1 if self._draft is None else self._draft.revision + 1
 
 
 def _encoded(pixels: UInt8[np.ndarray, "h w 3"], kind: str, **options: int) -> bytes:
@@ -370,6 +330,13 @@ def _encoded(pixels: UInt8[np.ndarray, "h w 3"], kind: str, **options: int) -> b
 
 GoalVerdict = Verdict | Literal["other table"]
 _MOST_REMEMBERED = 200
+_TEXTS: dict[Verdict, str] = {
+    "shown": "",
+    "doubtful": "It is not certain that this photo shows {objects}.",
+    "bare": "Nothing can be seen on the table in this photo; choose one that shows {objects}.",
+    "elsewhere": "This photo does not show the table as the goal camera sees it; crop it, or choose another one.",
+    "others": "This photo does not seem to show {objects}; choose another one, or a table with what it shows.",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -428,16 +395,13 @@ class GoalChecks:
             ProcessUnavailable: if what looks at photos has died.
         """
         record = self._goals.get(goal)
-        scene = scene or self._scenes.current
-        if scene is None:
-            raise NoTable
-        table = self._scenes.get(scene)
+        table = scene_or_current(self._scenes, scene, NoTable)
         if record.poses is not None:
             return self._made_here(record, table)
         if missing := sorted(set(table.state.names) - set(self._fields.names())):
             raise MissingFields(missing)
-        found = self._content(record, table)
-        return GoalCheck(found.verdict, _text(found.verdict, self._listed(table.state.names)))
+        verdict = self._content(record, table).verdict
+        return GoalCheck(verdict, _TEXTS[verdict].format(objects=self._listed(table.state.names)))
 
     def require(self, goal: str, scene: str) -> None:
         """Refuse a goal that makes no sense for a table.
@@ -481,17 +445,3 @@ class GoalChecks:
         labels = self._labels()
         *others, last = [f"the {labels[name].lower()}" if name in labels else name for name in names]
         return f"{', '.join(others)} and {last}" if others else last
-
-
-def _text(verdict: Verdict, objects: str) -> str:
-    match verdict:
-        case "shown":
-            return ""
-        case "doubtful":
-            return f"It is not certain that this photo shows {objects}."
-        case "bare":
-            return f"Nothing can be seen on the table in this photo; choose one that shows {objects}."
-        case "elsewhere":
-            return "This photo does not show the table as the goal camera sees it; crop it, or choose another one."
-        case "others":
-            return f"This photo does not seem to show {objects}; choose another one, or a table with what it shows."

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from osfcore.control.events import Looking
 from osfcore.errors import OsfError
-from osfcore.estimation.steps import UNPLACED_BELOW_M
+from osfcore.estimation.steps import UNPLACED_BELOW_M, EstimateStep
 from osfcore.geometry.cameras import Camera, default_cameras, goal_camera
 from osfcore.geometry.poses import Pose
 from osfcore.objects.asset_library import AssetLibrary
@@ -86,22 +86,19 @@ class Outliner:
             step.estimate is not None,
             (float(np.rad2deg(np.arctan2(y, x))), float(np.rad2deg(np.arcsin(np.clip(z, -1, 1))))),
             {
-                camera.name: tuple(
-                    ObjectOutlines(name, *self._of_object(camera, name, step.state.poses[n], step.candidates, n))
-                    for n, name in enumerate(step.state.names)
-                )
+                camera.name: tuple(self._of_object(camera, step, number) for number in range(len(step.state.names)))
                 for camera in cameras
             },
         )
 
-    def _of_object(
-        self, camera: Camera, name: str, best: Pose, candidates: Pose | None, number: int
-    ) -> tuple[Polygon, tuple[Polygon, ...]]:
-        tried: tuple[Polygon, ...] = ()
+    def _of_object(self, camera: Camera, step: EstimateStep, number: int) -> ObjectOutlines:
+        name, candidates = step.state.names[number], step.candidates
+        tried: list[Polygon] = []
         if candidates is not None:
             rows = np.unique(np.linspace(0, len(candidates.position) - 1, TRIED).astype(int))
-            tried = tuple(self._outline(camera, name, candidates[row, number]) for row in rows)
-        return self._outline(camera, name, best), tuple(polygon for polygon in tried if polygon)
+            tried = [self._outline(camera, name, candidates[row, number]) for row in rows]
+        best = self._outline(camera, name, step.state.poses[number])
+        return ObjectOutlines(name, best, tuple(polygon for polygon in tried if polygon))
 
     def _outline(self, camera: Camera, name: str, pose: Pose) -> Polygon:
         """Empty for what was not looked at yet, or lies behind the camera."""

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import threading
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -33,13 +31,13 @@ from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
 from app.processes.photo_process import PhotoRefused, photo_main
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
-from app.services.runner import Runner
-from app.storage.database import CannotStore, now_utc
+from app.services.runner import Runner, fill_inputs
+from app.storage.database import now_utc
 from app.storage.photos import GOAL_SIDE
 from app.storage.records import (
     PICTURE,
     STRAIGHT,
-    Damaged,
+    Files,
     GoalRecord,
     MarkedObject,
     Poses,
@@ -47,7 +45,8 @@ from app.storage.records import (
     TablePhotoStore,
     mask_file,
 )
-from osfcore.errors import CorruptFile, InvalidInput, NoRoom, NotThere, OsfError, UnknownName, check_seed
+from osfcore.errors import CorruptFile, InvalidInput, NoRoom, NotThere, OsfError, UnknownName, check_known, check_seed
+from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import MAX_OBJECTS, SceneState
 from osfcore.io.files import read_json
@@ -61,7 +60,6 @@ from osfcore.photo.table_layout import TableLayout, layout_of
 
 
 KIND = "photo"
-_NO_FILES: Mapping[str, bytes | None] = MappingProxyType({})
 
 
 class NothingMarked(OsfError):
@@ -83,7 +81,7 @@ class PhotosChanged:
     """A photograph is another one now, came or went."""
 
 
-class TablePhotos:
+class TablePhotos(TablePhotoStore):
     """The photographs of one service. Methods that change something block; any thread may call.
 
     Args:
@@ -97,44 +95,15 @@ class TablePhotos:
     """
 
     def __init__(self, runner: Runner, fields: FieldCatalogue, data_dir: Path, max_photos: int) -> None:
+        super().__init__(data_dir / "photos", max_photos)
         self._runner, self._fields = runner, fields
-        self._store = TablePhotoStore(data_dir / "photos", max_photos)
         self.looker = PhotoLooker()
-
-    def start(self) -> None:
-        """Remove what an earlier service left half done."""
-        self._store.start()
 
     def stop(self) -> None:
         """End the process that looks at photos, if there is one. Calling it again does nothing."""
         self.looker.stop()
 
     # Photographs
-
-    def all(self) -> tuple[TablePhoto, ...]:
-        """All photographs, newest first."""
-        return self._store.all()
-
-    def damaged(self) -> tuple[Damaged, ...]:
-        """Photographs that can only be deleted."""
-        return self._store.damaged()
-
-    def get(self, photo: str) -> TablePhoto:
-        """One photograph.
-
-        Raises:
-            UnknownName: if there is none.
-            CorruptFile: if it is damaged.
-        """
-        return self._store.get(photo)
-
-    def picture(self, photo: str) -> Path:
-        """What is shown of a photograph that exists."""
-        return self._store.picture(photo)
-
-    def mask(self, photo: str, name: str) -> Path:
-        """The mask of an object that was marked."""
-        return self._store.mask(photo, name)
 
     def receive(self, data: bytes, name: str, focal_px: float | None = None) -> TablePhoto:
         """Keep a photograph.
@@ -151,12 +120,13 @@ class TablePhotos:
             TooManyPhotos: if there are too many.
             StorageFull, CannotStore: if nothing more may be written, or the disk is full.
         """
-        read = self._read(data, focal_px)
+        read = self._look(data, focal_px)
         self._runner.storage.check_room()
         facts = uuid.uuid4().hex[:12], name, now_utc(), read.width, read.height, read.sent_width
         photo = TablePhoto(*facts, np.array(read.K), read.source, read.T_world_camera, read.notes)
-        self._store.keep(photo, data, read.jpeg, read.straight)
-        return self._told(photo)
+        self.keep(photo, data, read.jpeg, read.straight)
+        self._runner.hub.publish(PhotosChanged())
+        return photo
 
     def set_camera(self, photo: str, focal_px: float | None, camera: KnownCamera | None = None) -> TablePhoto:
         """Look at a photograph with another focal length, in pixels of the photo as it was sent, or calibrated camera.
@@ -165,12 +135,12 @@ class TablePhotos:
             UnknownName: if there is none.
             InvalidInput: if the focal length makes no sense, or the camera took photographs of another shape.
         """
-        read = self._read(self.read(self._store.sent(photo), photo), focal_px, camera)
+        read = self._look(self.read(self.sent(photo), photo), focal_px, camera)
         facts = {"K": np.array(read.K), "source": read.source, "T_world_camera": read.T_world_camera}
         files = {PICTURE: read.jpeg, STRAIGHT: read.straight}
         return self._outdated(photo, lambda latest: replace(latest, **facts, notes=read.notes), files)
 
-    def remove(self, photo: str) -> None:
+    def remove(self, name: str) -> None:
         """Delete a photograph, damaged or not; tables and goals that were made of it stay.
 
         Raises:
@@ -178,8 +148,8 @@ class TablePhotos:
             CannotStore: if that is not allowed.
         """
         with contextlib.suppress(CorruptFile):  # then nobody knows which search it began
-            self._end_search(self.get(photo))
-        self._store.remove(photo)
+            self._end_search(self.get(name))
+        super().remove(name)
         self._runner.storage.outdate()
         self._runner.hub.publish(PhotosChanged())
 
@@ -193,8 +163,7 @@ class TablePhotos:
             InvalidInput: if the mark makes no sense, nothing is found, or too many objects are marked.
         """
         before = self.get(photo)
-        if name not in (known := self._fields.names()):
-            raise UnknownName("object with a field", name[:80], known)
+        check_known("object with a field", [name], self._fields.names())
         if len({name, *(entry.name for entry in before.objects)}) > MAX_OBJECTS:
             raise InvalidInput("number of objects in the photo", len(before.objects) + 1, f"at most {MAX_OBJECTS}")
         others = tuple(point for each in before.objects if each.name != name for point in each.mark.on)
@@ -250,7 +219,7 @@ class TablePhotos:
             photos=tuple(map(_order, photos)),
         )  # fmt: skip
         with self._runner.jobs.new_inputs() as folder:
-            self._copy(photos, folder)
+            fill_inputs(folder, self._inputs(photos))
             job = self._runner.submit_with_inputs(KIND, params, folder)
         # What was marked meanwhile is not what is looked for.
         return self.change(photo, lambda latest: replace(latest, job=job.id) if _is_same(latest, first) else latest)
@@ -299,17 +268,19 @@ class TablePhotos:
 
     # Inside
 
-    def change(self, photo: str, changed: Callable[[TablePhoto], TablePhoto]) -> TablePhoto:
-        """Keep other facts of a photograph, made of the latest ones.
+    def change(self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: Files | None = None) -> TablePhoto:
+        """Keep other facts and files of a photograph, made of the latest ones, and tell so.
 
         Raises:
             UnknownName: if there is none, or as `changed`.
             CannotStore: if the disk is full.
         """
-        return self._told(self._store.change(photo, changed))
+        after = super().change(photo, changed, files or {})
+        self._runner.hub.publish(PhotosChanged())
+        return after
 
     def _outdated(
-        self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: Mapping[str, bytes | None] = _NO_FILES
+        self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: Files | None = None
     ) -> TablePhoto:
         """Keep a photograph of which something else is to be found now; a search for what was before ends."""
         self._end_search(self.get(photo))
@@ -318,7 +289,7 @@ class TablePhotos:
             after = changed(latest)
             return replace(after, objects=tuple(replace(each, choice=None) for each in after.objects), job=None)
 
-        return self._told(self._store.change(photo, then, files))
+        return self.change(photo, then, files)
 
     def _end_search(self, photo: TablePhoto) -> None:
         job = self.job(photo)
@@ -337,23 +308,16 @@ class TablePhotos:
         except FileNotFoundError:
             raise NotThere("photo") from None
 
-    def _told(self, photo: TablePhoto) -> TablePhoto:
-        self._runner.hub.publish(PhotosChanged())
-        return photo
+    def _inputs(self, photos: Sequence[TablePhoto]) -> dict[str, Path]:
+        """What the job gets of photographs, by the names that it knows."""
+        files: dict[str, Path] = {}
+        for number, photo in enumerate(photos):
+            masks = {entry.name: self.mask(photo.id, entry.name) for entry in photo.objects}
+            straight = self.straight(photo.id)
+            files |= inputs_of(number, straight if straight.is_file() else self.sent(photo.id), masks)
+        return files
 
-    def _copy(self, photos: Sequence[TablePhoto], folder: Path) -> None:
-        try:
-            folder.mkdir(parents=True)
-            for number, photo in enumerate(photos):
-                masks = {entry.name: self.mask(photo.id, entry.name) for entry in photo.objects}
-                straight = self._store.straight(photo.id)
-                source = straight if straight.is_file() else self._store.sent(photo.id)
-                for name, path in inputs_of(number, source, masks).items():
-                    shutil.copyfile(path, folder / name)
-        except OSError as error:
-            raise CannotStore(folder, error.strerror or str(error)) from error
-
-    def _read(self, data: bytes, focal_px: float | None, camera: KnownCamera | None = None) -> PhotoRead:
+    def _look(self, data: bytes, focal_px: float | None, camera: KnownCamera | None = None) -> PhotoRead:
         read = self.looker.ask(ReadPhoto(data, focal_px, camera))
         assert isinstance(read, PhotoRead)
         return read
@@ -361,8 +325,8 @@ class TablePhotos:
 
 def _is_same(one: TablePhoto, other: TablePhoto) -> bool:
     """Whether the same is marked, in pictures of the same camera."""
-    marks = ([(each.name, each.mark) for each in photo.objects] for photo in (one, other))
-    return next(marks) == next(marks) and np.array_equal(one.K, other.K)
+    now, before = ([(each.name, each.mark) for each in photo.objects] for photo in (one, other))
+    return now == before and np.array_equal(one.K, other.K)
 
 
 def _order(photo: TablePhoto) -> PhotoInput:
@@ -435,7 +399,8 @@ class PhotoTables:
         scene = self._runner.scenes.create(poses=tuple(layout.poses.items()), light=layout.light, is_measured=True)
         place = layout.T_table_photo
         self._photos.change(photo, lambda latest: replace(latest, scene=scene.id, T_table_photo=place))
-        return TableMade(scene, _moved(layout.poses, scene.initial))
+        rests = {name: scene.initial.pose(name) for name in layout.poses}
+        return TableMade(scene, _moved(layout.poses, rests))
 
     def make_goal(self, photo: str, scene: str | None = None, *, despite_doubts: bool = False) -> GoalMade:
         """A goal in which objects lie as in a photograph.
@@ -457,7 +422,7 @@ class PhotoTables:
         home = self._home(scene, {each.name for each in found.objects})
         layout = self._layout(record, None if home is None else home.id, despite_doubts=despite_doubts)
         camera = record.camera(layout.T_table_camera, GOAL_SIDE)
-        png = self._reduced(record, camera.width, camera.height)
+        png = self._reduced(record, camera)
         table = home or self._elsewhere(layout)
         try:
             made = self._runner.scenes.compose(ComposeGoal(table.id, tuple(layout.poses.items()), is_measured=True))
@@ -490,15 +455,11 @@ class PhotoTables:
         found = self._photos.found(record)
         if not despite_doubts and (doubts := self._photos.doubts(record, found)):
             raise PhotoDoubtful(doubts)
-        shared = self._shared_frame(record, scene) if found.table == "board" else None
-        return layout_of(found, _choices(record), shared)
-
-    def _shared_frame(self, record: TablePhoto, scene: str | None) -> Pose | None:
-        """Where the board lies on a table that was made of another photograph of it; None if that cannot be told."""
-        for other in (record, *self._photos.all()):
-            if scene is not None and other.scene == scene and other.T_world_camera is not None:
-                return other.T_table_photo
-        return None
+        T_table_board: Pose | None = None  # on the table, if that was made of a photograph of the same board
+        if found.table == "board" and scene is not None:
+            with_board = (each for each in (record, *self._photos.all()) if each.T_world_camera is not None)
+            T_table_board = next((each.T_table_photo for each in with_board if each.scene == scene), None)
+        return layout_of(found, _choices(record), T_table_board)
 
     def _home(self, scene: str | None, names: set[str]) -> SceneRecord | None:
         """The table that was asked for, else the current one if it holds the objects; None if there is none."""
@@ -524,22 +485,24 @@ class PhotoTables:
             return self._runner.scenes.compose(ComposeGoal(draft.id, seed=draft.seed, moved=count)).poses
         return self._runner.scenes.compose(ComposeGoal(draft.id, seed=draft.seed)).poses
 
-    def _reduced(self, record: TablePhoto, width: int, height: int) -> bytes:
+    def _reduced(self, record: TablePhoto, camera: Camera) -> bytes:
+        """PNG of a photograph, as large as a camera's images."""
         jpeg = self._photos.read(self._photos.picture(record.id), record.id)
         pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
         assert pixels is not None, "it was encoded here"
-        return encode_png(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)[..., ::-1])
+        size = camera.width, camera.height
+        return encode_png(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)[..., ::-1])
 
 
 def _choices(record: TablePhoto) -> dict[str, int]:
     return {entry.name: entry.choice or 0 for entry in record.objects}
 
 
-def _moved(asked: Mapping[str, Pose], rests: SceneState | Mapping[str, Pose]) -> tuple[str, ...]:
+def _moved(asked: Mapping[str, Pose], rests: Mapping[str, Pose]) -> tuple[str, ...]:
     """A sentence for each object that did not stay where it was found."""
     notes = []
     for name, pose in asked.items():
-        there = rests.pose(name) if isinstance(rests, SceneState) else rests[name]
+        there = rests[name]
         shift = float(np.linalg.norm((there.position - pose.position)[:2]))
         if shift > _STAYED_M:
             notes.append(f"{name} did not stay where the photo shows it: it moved by {100 * shift:.0f} cm.")

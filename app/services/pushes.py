@@ -15,7 +15,7 @@ from app.processes.messages.neural_messages import NeuralAnswer, PredictPushes
 from app.processes.messages.scene_messages import SceneRecord
 from app.services.estimates import errors_of
 from app.services.fields import MissingFields
-from app.services.scenes import Scenes
+from app.services.scenes import Scenes, scene_or_current
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts, check_actions
@@ -147,9 +147,7 @@ class Predictions:
     """
 
     def __init__(self, scenes: Scenes, fields: Callable[[], Collection[str]], link: ProcessClient) -> None:
-        self._scenes = scenes
-        self._fields = fields
-        self._link = link
+        self._scenes, self._fields, self._link = scenes, fields, link
 
     @property
     def is_warm(self) -> bool:
@@ -162,10 +160,7 @@ class Predictions:
         Raises:
             NothingToPush: if there is none.
         """
-        current = self._scenes.current
-        if current is None:
-            raise NothingToPush
-        return self._scenes.get(current)
+        return scene_or_current(self._scenes, None, NothingToPush)
 
     def submit(
         self,
@@ -196,7 +191,6 @@ class Predictions:
         if before is not None and set(before.names) != set(state.names):
             raise InvalidInput("objects one action ago", ", ".join(before.names), "those of the state")
         known = self._fields()
-        missing = [name for name in state.names if name not in known]
-        if missing:
+        if missing := [name for name in state.names if name not in known]:
             raise MissingFields(missing)
         return self._link.submit(PredictPushes(key or uuid.uuid4().hex, state, actions, before, method))

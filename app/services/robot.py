@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -23,14 +22,13 @@ from app.jobs.kinds.robots import CameraPicture, RobotParams, read_picture
 from app.services.event_hub import Notice
 from app.services.fields import FieldCatalogue
 from app.services.goals import Goals
-from app.services.runner import Runner
+from app.services.runner import Runner, fill_inputs
 from app.services.service_settings import Settings
-from app.storage.database import CannotStore
 from app.storage.photos import PhotoReader
 from osfcore.contrib.robots.connect import check_address, connect
 from osfcore.contrib.robots.http_robot import KEPT_SIDE, HttpRobot
 from osfcore.contrib.robots.robot import RobotDescription, SafetyLimits
-from osfcore.errors import OsfError, UnknownName, check_unique, shown
+from osfcore.errors import OsfError, check_known, check_unique, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import encode_jpeg
 
@@ -141,8 +139,7 @@ class RobotPictures:
             NoRobot, ConnectionLost, RobotRefused: as above.
         """
         known = {now.camera.name: now.picture for now in self.all()}
-        if name not in known:
-            raise UnknownName("camera of the robot", name, list(known))
+        check_known("camera of the robot", [name], known)
         picture = known[name]
         if picture is None:
             raise NoPicture(name, self._problem)
@@ -252,7 +249,7 @@ class RobotTable:
         self._connecting, self._ordering = threading.Lock(), threading.Lock()
         self._lost: OsfError | None = None  # why it did not answer when it was last asked what it is
         self._tried_at = 0.0  # when that was
-        self._stopped: tuple[str, str] | None = None  # the job that was stopped, and why
+        self._stopped: dict[str, str] = {}  # why the job was stopped that was stopped last
         self._watched: tuple[str, float] | None = None  # the page that let it move, and when it was last heard of
         self._leave: Callable[[], None] = lambda: None
         self._reader = PhotoReader()  # of its own: what a robot sends holds up nobody's photos
@@ -303,8 +300,7 @@ class RobotTable:
         cameras = [camera.name for camera in self._described().cameras]
         assert self._url is not None, "or it had not been described"
         goal = self._goals.get(asked.goal)
-        if goal.camera.name not in cameras:
-            raise UnknownName("camera of the robot", goal.camera.name, cameras)
+        check_known("camera of the robot", [goal.camera.name], cameras)
         check_unique("objects", asked.names, "each named once")
         self._fields.require(asked.names, "ours")
         params = RobotParams(
@@ -315,11 +311,7 @@ class RobotTable:
         with self._ordering, self._runner.jobs.new_inputs() as folder:
             if self._live() is not None:
                 raise RobotBusy
-            try:
-                folder.mkdir(parents=True)
-                shutil.copyfile(self._goals.image(goal.id), folder / GOAL_FILE)
-            except OSError as error:
-                raise CannotStore(folder, error.strerror or str(error)) from error
+            fill_inputs(folder, {GOAL_FILE: self._goals.image(goal.id)})
             self._runner.submit_with_inputs(KIND, params, folder)
         return self._now()
 
@@ -360,17 +352,17 @@ class RobotTable:
         sent.start()
         job = self._live()
         if job is not None:
-            if self._stopped is None or self._stopped[0] != job.id:
-                self._stopped = job.id, f"The robot was stopped: {reason}."
-                self._runner.hub.publish(Notice("warning", self._stopped[1]))
+            if job.id not in self._stopped:
+                why = f"The robot was stopped: {reason}."
+                self._stopped = {job.id: why}
+                self._runner.hub.publish(Notice("warning", why))
             threading.Thread(target=self._cancel, args=(job.id,), name="robot cancel", daemon=True).start()
         sent.join(_STOP_WAIT_S)
         return self._now()
 
     def _cancel(self, job: str) -> None:
-        why = self._stopped[1] if self._stopped is not None and self._stopped[0] == job else None
         with contextlib.suppress(OsfError):  # it may be over meanwhile
-            self._runner.jobs.cancel(job, why=why)
+            self._runner.jobs.cancel(job, why=self._stopped.get(job))
 
     def _now(self) -> RobotNow:
         job, about = self._latest(), self._about
@@ -456,8 +448,8 @@ class RobotTable:
         if job is None:
             return "idle", ""
         drives = (job.result or {}).get("drives", "looking")
-        if self._stopped is not None and self._stopped[0] == job.id:
-            return "stopped", self._stopped[1]
+        if (why := self._stopped.get(job.id)) is not None:
+            return "stopped", why
         if not job.is_finished:
             return ("driving" if drives == "over" else drives), job.note
         if job.state == "done":

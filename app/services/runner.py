@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shutil
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +22,7 @@ from app.services.event_hub import Hub, Notice
 from app.services.image_sets import ImageSets
 from app.services.scenes import DEMO_OBJECTS, Scenes
 from app.services.service_settings import Settings
-from app.storage.database import Store
+from app.storage.database import CannotStore, Store
 from app.storage.field_files import Leftover, remove_workshop, sweep, workshops
 from app.storage.usage import StorageMeter
 from osfcore.errors import InvalidInput, OsfError, UnknownName
@@ -165,11 +167,10 @@ class Runner:
             OsfError: if it could not succeed, or too many wait.
         """
         self.storage.check_room()
-        fetches = kind == "fetch_assets"
         with self._ordering:
             if isinstance(params, TrainFieldParams):
                 self._check_training(params)
-            known = self.library.info if fetches else self.library.check
+            known = self.library.info if kind == "fetch_assets" else self.library.check
             KINDS[kind].check(params, known, len(self.library.names()))
             return self.jobs.submit(kind, params.to_json())
 
@@ -279,17 +280,34 @@ class Runner:
 
     def _on_job(self, event: JobEvent) -> None:
         self.hub.publish(event)
-        match event:
-            case JobChanged(_, Job(kind="fetch_assets" | "add_object", state="done")):
-                self.ensure_demo_scene()
-            case JobChanged(_, Job(kind="episode") as job) if job.is_finished:
-                if (scene := job.scene) is not None and self.jobs.needs(scene) is None:
-                    # In the background: the jobs' thread must not wait for the simulation.
-                    threading.Thread(target=self._undo_disturbances, args=(scene,), daemon=True).start()
-            case _:
-                pass
+        if not isinstance(event, JobChanged):
+            return
+        job, scene = event.job, event.job.scene
+        if job.kind in ("fetch_assets", "add_object") and job.state == "done":
+            self.ensure_demo_scene()
+        if job.kind == "episode" and job.is_finished and scene is not None and self.jobs.needs(scene) is None:
+            # In the background: the jobs' thread must not wait for the simulation.
+            threading.Thread(target=self._undo_disturbances, args=(scene,), daemon=True).start()
 
     def _undo_disturbances(self, scene: str) -> None:
         """What was done to fool an episode ends with it, or the next one would begin in the dark."""
         with contextlib.suppress(OsfError):  # the scene may be gone, and the simulation just starting again
             self.scenes.undo_disturbances(scene)
+
+
+def fill_inputs(folder: Path, files: Mapping[str, Path]) -> None:
+    """Make a folder of inputs for a job, with copies of files.
+
+    Args:
+        folder: from `Jobs.new_inputs`.
+        files: what is copied, by its name in the folder.
+
+    Raises:
+        CannotStore: if the disk refuses.
+    """
+    try:
+        folder.mkdir(parents=True)
+        for name, file in files.items():
+            shutil.copyfile(file, folder / name)
+    except OSError as error:
+        raise CannotStore(folder, error.strerror or str(error)) from error

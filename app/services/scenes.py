@@ -40,7 +40,8 @@ from app.processes.sim_process import simulation_main
 from app.services.event_hub import CurrentScene, Hub, Notice
 from app.services.service_settings import Settings
 from app.storage.database import CannotStore, Store, now_utc
-from osfcore.errors import InvalidInput, NotThere, OsfError
+from app.storage.records import Poses
+from osfcore.errors import InvalidInput, NotThere, OsfError, check_unique
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -150,7 +151,7 @@ class Scenes:
         count: int = DEMO_OBJECTS,
         seed: int | None = None,
         light: Light | None = None,
-        poses: tuple[tuple[str, Pose], ...] | None = None,
+        poses: Poses | None = None,
         image_size: int = DEFAULT_IMAGE_SIDE,
         *,
         is_measured: bool = False,
@@ -169,22 +170,22 @@ class Scenes:
             is_shown: at once, in viewer and pages.
         """
         image_side(image_size)
-        names = self._check_names(names if poses is None else _posed(names, poses))
+        names = self._checked_names(names, poses)
+        stacked = None if poses is None else _stacked(poses)
         with self._lock:
             if len(self._records) + self._scenes_in_the_making >= self._settings.max_scenes:
                 raise TooManyScenes(self._settings.max_scenes)
             self._scenes_in_the_making += 1
         seed = secrets.randbelow(MAX_SEED) if seed is None else seed
-        stacked = None if poses is None else _stacked([pose for _, pose in poses])
-        facts = uuid.uuid4().hex[:12], seed, now_utc(), image_size
-        command = CreateScene(*facts, names, count, light, stacked, is_measured)
+        scene = uuid.uuid4().hex[:12]
+        command = CreateScene(scene, seed, now_utc(), image_size, names, count, light, stacked, is_measured)
         try:
             record: SceneRecord = self._simulation.call(command)
             with self._lock:
                 self._store.save_scene(record)
                 self._records[record.id] = record
         except CannotStore:
-            self._simulation.submit(DropScene(command.id))
+            self._simulation.submit(DropScene(scene))
             raise
         finally:
             with self._lock:
@@ -226,9 +227,7 @@ class Scenes:
         self._check_free(scene)
         return self._change(ResetScene(scene), can_be_undone=True)
 
-    def edit(
-        self, scene: str, light: Light | None = None, poses: tuple[tuple[str, Pose], ...] = (), *, settle: bool = False
-    ) -> SceneRecord:
+    def edit(self, scene: str, light: Light | None = None, poses: Poses = (), *, settle: bool = False) -> SceneRecord:
         """Move light and objects by hand, all or nothing.
 
         Args:
@@ -366,13 +365,19 @@ class Scenes:
         self._simulation.submit(ShowScene(scene))
         self._hub.publish(CurrentScene(None if scene is None else self._records[scene]))
 
-    def _check_names(self, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        if names is not None and not 1 <= len(names) <= MAX_OBJECTS:
-            raise InvalidInput("number of objects", len(names), f"between 1 and {MAX_OBJECTS}")
-        if len(set(names or ())) != len(names or ()):
-            raise InvalidInput("list of objects", ", ".join(names or ()), "without repetition")
-        for name in names or ():
-            self._library.check(name)
+    def _checked_names(self, names: tuple[str, ...] | None, poses: Poses | None) -> tuple[str, ...] | None:
+        """The objects of a new scene, those of the poses if it has any; None for random ones."""
+        if poses is not None:
+            posed = tuple(name for name, _ in poses)
+            if names is not None and set(names) != set(posed):
+                raise InvalidInput("list of objects", ", ".join(names), "the objects that have poses, or left out")
+            names = posed
+        if names is not None:
+            if not 1 <= len(names) <= MAX_OBJECTS:
+                raise InvalidInput("number of objects", len(names), f"between 1 and {MAX_OBJECTS}")
+            check_unique("list of objects", names)
+            for name in names:
+                self._library.check(name)
         return names
 
     def _check_free(self, scene: str) -> None:
@@ -393,22 +398,31 @@ class Scenes:
         self._hub.publish(event)
 
 
-def _posed(names: tuple[str, ...] | None, poses: tuple[tuple[str, Pose], ...]) -> tuple[str, ...]:
-    posed = tuple(name for name, _ in poses)
-    if names is not None and set(names) != set(posed):
-        raise InvalidInput("list of objects", ", ".join(names), "the objects that have poses, or left out")
-    return posed
+def scene_or_current(scenes: Scenes, scene: str | None, without: type[OsfError]) -> SceneRecord:
+    """One scene, by default the one that is shown.
+
+    Args:
+        scenes: of the service.
+        scene: identifier; None for the current one.
+        without: the error if none is named and none is shown.
+
+    Raises:
+        UnknownName: if there is none of this name.
+    """
+    scene = scene or scenes.current
+    if scene is None:
+        raise without
+    return scenes.get(scene)
 
 
-def _check_poses(poses: tuple[tuple[str, Pose], ...]) -> None:
-    if len({name for name, _ in poses}) != len(poses):
-        raise InvalidInput("list of objects", ", ".join(name for name, _ in poses), "without repetition")
-    _stacked([pose for _, pose in poses])
+def _check_poses(poses: Poses) -> None:
+    check_unique("list of objects", [name for name, _ in poses])
+    _stacked(poses)
 
 
-def _stacked(poses: list[Pose]) -> Pose:
+def _stacked(poses: Poses) -> Pose:
     """Poses as one batch, with quaternions checked."""
-    stacked = Pose.stacked(poses)
+    stacked = Pose.stacked([pose for _, pose in poses])
     return Pose(stacked.position, unit_quaternion(stacked.quaternion, "quaternions"))
 
 

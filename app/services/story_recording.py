@@ -59,14 +59,15 @@ def record_story(preset: Preset, data_dir: Path, out: Path) -> Iterator[EpisodeS
                 goal = step.event
             case Stepped(0, _, estimate):
                 first = estimate
-            case _:
-                pass
         report = step.report or report
         yield step
     assert seen is not None and goal is not None and first is not None, "every episode begins so"  # noqa: PT018
     prepared = _prepared(order, seen, first, goal)
     write_json(out / PREPARED_FILE, prepared_to_json(prepared))
-    _write_pictures(folder, out)
+    # What the goal camera saw after each round, row by row: a WebP is at most 16,383 px high.
+    frames = list(read_frames(folder / FRAMES_FOLDER))
+    _write_grid(out / "goal.webp", [part_of(frames[0], "goal")], columns=1)
+    _write_grid(out / "now.webp", [part_of(frame, "now") for frame in frames], columns=NOW_COLUMNS)
     shutil.copyfile(folder / TRAJECTORY_FILE, out / TRAJECTORY_FILE)
     write_json(out / STORY_FILE, _told(preset, read_json(folder / REPORT_FILE, as_mapping), out / TRAJECTORY_FILE))
     shutil.rmtree(folder)
@@ -99,13 +100,6 @@ def _told(preset: Preset, report: dict[str, Any], trajectory: Path) -> dict[str,
         "light_off_deg": steps[0]["light_off_deg"],
         "outcome": report["outcome"],
     }
-
-
-def _write_pictures(folder: Path, out: Path) -> None:
-    """Write the goal, and what the goal camera saw after each round, row by row: a WebP is at most 16,383 px high."""
-    frames = list(read_frames(folder / FRAMES_FOLDER))
-    _write_grid(out / "goal.webp", [part_of(frames[0], "goal")], columns=1)
-    _write_grid(out / "now.webp", [part_of(frame, "now") for frame in frames], columns=NOW_COLUMNS)
 
 
 def _write_grid(path: Path, images: list[UInt8[np.ndarray, "h w 3"]], columns: int) -> None:

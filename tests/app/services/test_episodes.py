@@ -226,7 +226,7 @@ def test_a_full_disk_is_told_and_leaves_nothing(episodes, tmp_path, monkeypatch)
         to.write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("app.services.episodes.shutil.copyfile", full)
+    monkeypatch.setattr("shutil.copyfile", full)
     with pytest.raises(CannotStore):
         episodes.start(chosen(), goal="made")
     assert left_over(tmp_path) == []

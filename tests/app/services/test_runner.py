@@ -127,7 +127,10 @@ def test_a_dying_simulation_is_told_and_the_scenes_live_on(open_runner):
 
 def test_scenes_have_a_limit(open_runner):
     runner = open_runner(demo_scene=False, max_scenes=1)
-    runner.scenes.create(names=(BOX,))
+    askew = Pose(np.array([0.0, 0, 0.1]), np.array([0.5, 0, 0, 0]))
+    with pytest.raises(InvalidInput, check=about("quaternion")):
+        runner.scenes.create(poses=((BOX, askew),))
+    runner.scenes.create(names=(BOX,))  # one that was refused does not count
     with pytest.raises(TooManyScenes):
         runner.scenes.create(names=(BOX,))
 
