@@ -162,11 +162,7 @@ class JobControl:
 
     def changes(self) -> list[dict[str, Any]]:
         """Parameters that were sent since the last call, the latest last."""
-        changes = []
-        with contextlib.suppress(queue.Empty):
-            while True:
-                changes.append(self._changes.get_nowait())
-        return changes
+        return [self._changes.get() for _ in range(self._changes.qsize())]  # nobody else takes any
 
     def next_change(self) -> dict[str, Any] | None:
         """Wait for parameters that are sent; None if the job is cancelled first."""
@@ -190,24 +186,20 @@ class JobControl:
         """
         number, latest = next(self._numbers), time.monotonic() + self._answer_s
         self._send(SceneCommand(command, number))
-        answer = self._answer_to(number)
-        while answer is None:
-            if self._is_cancelled.is_set():
-                raise OsfError("This job was cancelled while it waited for the simulation.")
-            if time.monotonic() > latest:
-                raise ProcessUnavailable("service", f"did not answer this job within {self._answer_s:g} s")
-            answer = self._answer_to(number)
-        if answer.error is not None:
-            raise answer.error
-        return answer.value
-
-    def _answer_to(self, number: int) -> Answer | None:
-        """The answer to a question, if it comes in a moment; one that came too late for its own is dropped."""
-        with contextlib.suppress(queue.Empty):
-            while (answer := self._answers.get(timeout=_LOOKS_EVERY_S)).number != number:
-                pass
-            return answer
-        return None
+        while True:
+            try:
+                answer = self._answers.get(timeout=_LOOKS_EVERY_S)
+            except queue.Empty:
+                if self._is_cancelled.is_set():
+                    raise OsfError("This job was cancelled while it waited for the simulation.") from None
+                if time.monotonic() > latest:
+                    what = f"did not answer this job within {self._answer_s:g} s"
+                    raise ProcessUnavailable("service", what) from None
+                continue
+            if answer.number == number:  # else it came too late for its own question
+                if answer.error is not None:
+                    raise answer.error
+                return answer.value
 
     def take(self, order: object) -> None:
         """Take an order, or the answer to `ask`."""

@@ -77,10 +77,6 @@ class JobFolders:
         except OSError as error:
             raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
 
-    def remove(self, job: str) -> None:
-        """Remove the folder of a job that was not accepted, if it has one."""
-        shutil.rmtree(self.folder(job), ignore_errors=True)
-
 
 def remove_half_made(folder: Path) -> None:
     """Remove from a job's folder what had not got its name yet when whoever made it ended."""

@@ -14,14 +14,6 @@ if TYPE_CHECKING:
     from app.jobs.job import Job
 
 
-def _refuse_nothing(params: object, check_object: Callable[[str], object], available: int) -> None:
-    pass
-
-
-def _leave_nothing(data_dir: Path, job: Job, others: Sequence[Job]) -> None:
-    pass
-
-
 @dataclass(frozen=True, slots=True)
 class JobKind:
     """A kind of job.
@@ -52,12 +44,12 @@ class JobKind:
     words: str
     run: Callable[[Any, JobContext], Iterator[Any]]
     params: type[JobParams]
-    check: Callable[[Any, Callable[[str], object], int], None] = _refuse_nothing
+    check: Callable[[Any, Callable[[str], object], int], None] = lambda *_: None
     preloads: tuple[str, ...] = ()
     uses_physics: bool = False
     has_folder: bool = True
     keeps_steps: bool = False
     goes_on: bool = False
     ends_at_once: bool = False
-    on_cancelled: Callable[[Path, Job, Sequence[Job]], None] = _leave_nothing
+    on_cancelled: Callable[[Path, Job, Sequence[Job]], None] = lambda *_: None
     on_broken_off: Callable[[Job, Path], Job] = lambda job, _: job

@@ -112,21 +112,16 @@ class JobLoop:
         self._table.publish_queue()
 
     def _attend(self) -> None:
-        """Follow the running job until its process has ended."""
+        """Follow the running job until its process has ended, and note what has become of it."""
         run = self.run
         assert run is not None
-        outcome: Outcome | None = None
-        while outcome is None:
-            outcome = run.wait()
+        while (outcome := run.wait()) is None:
             with self._changed:
-                if outcome is None:
-                    self._table.flush_progress()
-                if outcome is None and self._is_stopping:
+                self._table.flush_progress()
+                if self._is_stopping:
                     outcome = JobStopped()
+                    break
         run.end()
-        self._finish(run, outcome)
-
-    def _finish(self, run: JobProcess, outcome: Outcome) -> None:
         with self._changed:  # until whoever has cancelled it has said why
             job = self._table[run.id]
         if run.is_cancelled and not isinstance(outcome, dict):
@@ -153,7 +148,9 @@ class JobLoop:
             case SceneCommand():
                 self._serving.submit(self._answer, run, event)
             case JobRests():
-                self._rest(run)
+                with self._changed:
+                    run.clock.switch(is_running=False)
+                    self._table.set(replace(self._table[run.id], state="paused", eta_s=None))
 
     def _progress(self, run: JobProcess, step: JobStep) -> None:
         with self._changed:
@@ -172,27 +169,17 @@ class JobLoop:
         In a thread of its own: the simulation may hang, and the job must be heard, and cancelled, meanwhile.
         """
         try:
-            was_sent = run.order(self._answer_to(run, asked))
+            scene = self._table[run.id].scene
+            if self._serve is None or asked.command.id != scene:
+                raise UnknownName("scene of this job", asked.command.id, [str(scene)])
+            was_sent = run.order(Answer(asked.number, self._serve(asked.command)))
+        except OsfError as error:
+            was_sent = run.order(Answer(asked.number, error=error))
         except Exception as error:  # whatever it is, the job must not wait for ever
             _log.exception("%s that a job asked for could not be done", type(asked.command).__name__)
             was_sent = run.order(Answer(asked.number, error=InternalError("service's answer to this job", error)))
         if not was_sent and not run.is_cancelled:
             _log.warning("a job that takes no orders any more was not told what it had asked for")
-
-    def _answer_to(self, run: JobProcess, asked: SceneCommand) -> Answer:
-        scene = self._table[run.id].scene
-        try:
-            if self._serve is None or asked.command.id != scene:
-                raise UnknownName("scene of this job", asked.command.id, [str(scene)])
-            return Answer(asked.number, self._serve(asked.command))
-        except OsfError as error:
-            return Answer(asked.number, error=error)
-
-    def _rest(self, run: JobProcess) -> None:
-        """The job has come to the end of a round, and waits."""
-        with self._changed:
-            run.clock.switch(is_running=False)
-            self._table.set(replace(self._table[run.id], state="paused", eta_s=None))
 
 
 def clear_cancelled(data_dir: Path, table: JobTable, job: Job) -> None:

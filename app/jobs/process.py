@@ -47,7 +47,7 @@ class JobProcess:
         data_dir: of the service.
         folder: the job's own; exists.
         on_event: called from another thread with everything that the job tells.
-        client: a process that runs already, and passes on what it tells; started here if None.
+        client: a process that runs already; started here if None.
         on_end: called once the process has ended.
 
     Raises:
@@ -68,7 +68,8 @@ class JobProcess:
         self.clock = JobClock()
         self._cancel_at = math.inf  # when patience with a cancelled job ends
         self._on_end = on_end
-        self._client = client or ProcessClient(job_main, (), WHO, answer_s=math.inf, on_event=on_event)
+        self._client = client or ProcessClient(job_main, (), WHO, answer_s=math.inf)
+        self._client.on_event = on_event
         self._client.start()  # does nothing where it runs
         self._answer = self._client.submit(RunJob(job.kind, job.params, data_dir, folder))
 
@@ -155,23 +156,6 @@ class JobClock:
 _log = logging.getLogger(__name__)
 
 
-class _Spare:
-    """A process without a job."""
-
-    def __init__(self) -> None:
-        self.on_event: Callable[[object], None] | None = None
-        self.client = ProcessClient(job_main, (True,), WHO, answer_s=math.inf, on_event=self._pass_on)
-        self.client.start()
-
-    @property
-    def is_alive(self) -> bool:
-        return self.client.status in ("starting", "ready")
-
-    def _pass_on(self, event: object) -> None:
-        if self.on_event is not None:
-            self.on_event(event)
-
-
 class Standby:
     """Starts the processes of jobs, and keeps one in reserve while no job runs. Any thread may call.
 
@@ -183,7 +167,7 @@ class Standby:
     def __init__(self, after_s: float = 3.0) -> None:
         self._after_s = after_s
         self._lock = threading.Lock()
-        self._spare: _Spare | None = None
+        self._spare: ProcessClient | None = None
         self._timer: threading.Timer | None = None
         self._is_stopped = False
 
@@ -206,7 +190,7 @@ class Standby:
         if timer is not None:
             timer.cancel()
         if spare is not None:
-            spare.client.stop()
+            spare.stop()
 
     def process(self, job: Job, data_dir: Path, folder: Path, on_event: Callable[[object], None]) -> JobProcess:
         """The process of a job, see `JobProcess`.
@@ -223,22 +207,21 @@ class Standby:
         with self._lock:
             if self._timer is not None:
                 self._timer.cancel()
-            spare = self._spare if KINDS[job.kind].preloads else None
-            if spare is not None:
-                self._spare = None
-        if spare is not None and not spare.is_alive:
-            spare.client.stop()
             spare = None
-        if spare is not None:
-            spare.on_event = on_event
-        client = None if spare is None else spare.client
-        return JobProcess(job, data_dir, folder, on_event, client=client, on_end=self.prepare)
+            if KINDS[job.kind].preloads:
+                spare, self._spare = self._spare, None
+        if spare is not None and spare.status == "restarting":  # it has died
+            spare.stop()
+            spare = None
+        return JobProcess(job, data_dir, folder, on_event, client=spare, on_end=self.prepare)
 
     def _start(self) -> None:
         with self._lock:
-            if self._is_stopped or (self._spare is not None and self._spare.is_alive):
+            if self._is_stopped or (self._spare is not None and self._spare.status != "restarting"):
                 return
+            spare = ProcessClient(job_main, (True,), WHO, answer_s=math.inf)
             try:
-                self._spare = _Spare()
+                spare.start()
+                self._spare = spare
             except OSError as error:  # jobs start without it, only later
                 _log.warning("no process could be prepared: %s", error.strerror)

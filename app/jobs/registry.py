@@ -6,7 +6,6 @@ A service that stops fails the job it was running; waiting ones go on after the 
 from __future__ import annotations
 
 import contextlib
-import logging
 import shutil
 import threading
 import uuid
@@ -25,9 +24,6 @@ from app.jobs.table import JobTable
 from app.processes.messages.scene_messages import JobCommand
 from app.storage.database import CannotStore, Store
 from osfcore.errors import OsfError
-
-_RETRY_S = 1.0  # after the job loop has failed
-_log = logging.getLogger(__name__)
 
 
 class WrongJobState(OsfError):
@@ -125,8 +121,8 @@ class Jobs:
             UnknownName: if there is no such job.
         """
         with self._changed:
-            known = self._table.get(job)
-            self._table.set(replace(self._table[job], params={**known.params, "title": title}))
+            params = {**self.get(job).params, "title": title}
+            self._table.set(replace(self._table[job], params=params))
             return self.get(job)
 
     def get(self, job: str, kind: str | None = None) -> Job:
@@ -147,11 +143,11 @@ class Jobs:
 
     def holder(self, scene: str) -> Job | None:
         """The job that drives a scene now, if one does: its parameters name it as "scene"."""
-        return next((job for job in self._driving(scene) if job.state == "running"), None)
+        return next((job for job in self.live() if job.scene == scene and job.state == "running"), None)
 
     def needs(self, scene: str) -> Job | None:
         """A job that waits, runs or pauses and drives a scene, if there is one."""
-        return next(iter(self._driving(scene)), None)
+        return next((job for job in self.live() if job.scene == scene), None)
 
     def inputs(self, job: str) -> Path:
         """Where a job's inputs are, if it was given any."""
@@ -182,7 +178,7 @@ class Jobs:
                     self._folders.take(job.id, inputs)
                 self._table.add(job)
             except OsfError:
-                self._folders.remove(job.id)
+                shutil.rmtree(self.folder(job.id), ignore_errors=True)
                 raise
             self._changed.notify_all()
             return self.get(job.id)
@@ -271,26 +267,23 @@ class Jobs:
             WrongJobState: if it neither runs nor pauses, or is just ending.
         """
         with self._changed:
-            known = self.get(job)
-            if known.state not in ("running", "paused") or self._loop.run is None or self._loop.run.is_cancelled:
-                raise WrongJobState(known, "changed")
-            if not self._loop.run.order(ChangeJob(params)):
-                raise WrongJobState(known, "changed", is_over=True)
-            self._table.set(replace(self._table[job], params={**known.params, **params}))
+            self._order(job, ("running", "paused"), ChangeJob(params), "changed")
+            known = self._table[job]
+            self._table.set(replace(known, params={**known.params, **params}))
             return self.get(job)
 
     def _switch(self, job: str, before: State, after: State, order: PauseJob | ResumeJob | StepJob) -> Job:
         with self._changed:
-            known = self.get(job)
-            wanted = "paused" if after == "paused" else "resumed"
-            if known.state != before or self._loop.run is None or self._loop.run.is_cancelled:
-                raise WrongJobState(known, wanted)
-            if not self._loop.run.order(order):
-                raise WrongJobState(known, wanted, is_over=True)
-            self._loop.run.clock.switch(is_running=after == "running")
+            run = self._order(job, (before,), order, "paused" if after == "paused" else "resumed")
+            run.clock.switch(is_running=after == "running")
             self._table.set(replace(self._table[job], state=after, eta_s=None))
             return self.get(job)
 
-    def _driving(self, scene: str) -> list[Job]:
-        """Return the jobs that wait, run or pause and name a scene in their parameters."""
-        return [job for job in self.live() if job.scene == scene]
+    def _order(self, job: str, states: tuple[State, ...], order: object, wanted: str) -> JobProcess:
+        """Give an order to a job that must be in one of these states; returns its process."""
+        known, run = self.get(job), self._loop.run
+        if known.state not in states or run is None or run.is_cancelled:
+            raise WrongJobState(known, wanted)
+        if not run.order(order):
+            raise WrongJobState(known, wanted, is_over=True)
+        return run

@@ -15,7 +15,7 @@ from app.processes.server import ProcessServer
 from osfcore.errors import OsfError
 
 STEP_INTERVAL_S = 0.1
-_NOT_EXTRA = ("done", "total", "note", "view")
+_NOT_EXTRA = ("done", "total", "note", "view")  # fields of a step that are no part of the result
 
 
 def _prepare() -> None:
@@ -70,7 +70,8 @@ def run_job(
     context = JobContext(job.data_dir, job.folder, control)
     with contextlib.closing(kind.run(kind.params.from_json(job.params), context)) as steps:  # pyright: ignore[reportArgumentType]
         for step in steps:
-            result = _extras(step)
+            extras = [field.name for field in dataclasses.fields(step) if field.name not in _NOT_EXTRA]
+            result = {name: getattr(step, name) for name in extras}
             now = time.monotonic()
             if now - last >= step_interval_s or step.done == step.total or getattr(step, "must_be_told", False):
                 send(JobStep(step.done, step.total, step.note, result, getattr(step, "view", None)))
@@ -80,11 +81,3 @@ def run_job(
             if control.must_stop():
                 return JobCancelled()
     return result
-
-
-def _extras(step: object) -> dict[str, Any]:
-    """What a step tells besides done, total, note and what the live view draws."""
-    if not dataclasses.is_dataclass(step) or isinstance(step, type):
-        return {}
-    names = (field.name for field in dataclasses.fields(step))
-    return {name: getattr(step, name) for name in names if name not in _NOT_EXTRA}

@@ -90,11 +90,9 @@ def end(process: SpawnProcess, grace_s: float = 0.0) -> None:
     """Wait `grace_s` for a process to leave by itself, then end it and its group. Calling it again does nothing."""
     process.join(grace_s)
     if process.is_alive() and process.pid is not None:
-        try:
+        with contextlib.suppress(ProcessLookupError):  # it has just left
             if os.getpgid(process.pid) == process.pid:
                 os.killpg(process.pid, signal.SIGKILL)
-        except ProcessLookupError:  # it has just left
-            pass
         process.kill()
     process.join()
     for _ in range(_NOTING_TRIES):  # another thread may have taken the exit code, and be about to note it

@@ -60,10 +60,6 @@ class ProcessBusy(OsfError):
         super().__init__(f"The {who} has too much to do at once; try again in a moment.")
 
 
-def _ignore(_: object = None) -> None:
-    pass
-
-
 class ProcessClient:
     """A child process, and threads that listen to it, write to it and watch it. Nobody who sends waits for it.
 
@@ -91,37 +87,28 @@ class ProcessClient:
         answer_s: float = ANSWER_S,
         keeps_running: bool = False,
         greeting: Callable[[], Iterable[object]] = tuple,
-        on_event: Callable[[Any], None] = _ignore,
-        on_lost: Callable[[], None] = _ignore,
+        on_event: Callable[[Any], None] = lambda _: None,
+        on_lost: Callable[[], None] = lambda: None,
     ) -> None:
         self._child = (target, who, *arguments)
         self._who = who
         self._answer_s = answer_s
         self._keeps_running = keeps_running
-        self._greeting, self._on_event, self._on_lost = greeting, on_event, on_lost
+        self._greeting, self.on_event, self._on_lost = greeting, on_event, on_lost
         self._launch_lock = threading.RLock()  # taken before the other
         self._lock = threading.Lock()
         self._numbers = itertools.count(1)
         self._pending: dict[int, Future[Any]] = {}
-        self._process: SpawnProcess | None = None
         self._outbox: Outbox | None = None  # of the process that runs now
         self._watchdog: Watchdog | None = None
         self._verdict: ProcessUnavailable | None = None  # why it was killed
         self._listener: threading.Thread | None = None
         self._stopping = threading.Event()
         self._deaths, self._died_at = 0, 0.0
-        self._is_loading, self._is_warm = True, False
+        self._is_loading = True
+        self.process: SpawnProcess | None = None  # that runs now, or ran last
+        self.is_warm = False  # whether it has answered: the first answer waits for code to be loaded or compiled
         self.status: Status = "starting"
-
-    @property
-    def process(self) -> SpawnProcess | None:
-        """The process that runs now, or ran last."""
-        return self._process
-
-    @property
-    def is_warm(self) -> bool:
-        """Whether the process that runs now has answered: the first answer waits for code to be loaded or compiled."""
-        return self._is_warm
 
     def start(self) -> None:
         """Start the process now; requests may be sent at once.
@@ -137,7 +124,7 @@ class ProcessClient:
         """End the process, `grace_s` after it was to end by itself. Calling it again does nothing."""
         with self._launch_lock:
             self._stopping.set()
-            process, listener = self._process, self._listener
+            process, listener = self.process, self._listener
         if process is not None:
             end(process, grace_s)
         if listener is not None and listener is not threading.current_thread():
@@ -225,7 +212,7 @@ class ProcessClient:
     def _launch(self) -> None:
         greeting = [Request(0, command) for command in self._greeting()]
         process, connection = launch(child_main, f"osf-{self._who.replace(' ', '-')}", *self._child)
-        self._process, self._is_loading, self._is_warm, self._verdict = process, True, False, None
+        self.process, self._is_loading, self.is_warm, self._verdict = process, True, False, None
         try:
             outbox = Outbox(connection)
             for request in greeting:  # whatever is sent from now on comes after it
@@ -242,11 +229,11 @@ class ProcessClient:
         """How long it may answer nobody now: loading comes first, and compiling with the first answer."""
         if self._is_loading:
             return max(self._answer_s, ANSWER_S)
-        return min(self._answer_s, WARM_ANSWER_S) if self._is_warm and math.isfinite(self._answer_s) else self._answer_s
+        return min(self._answer_s, WARM_ANSWER_S) if self.is_warm and math.isfinite(self._answer_s) else self._answer_s
 
     def _kill(self, is_frozen: bool) -> None:
         """End a process that shows no sign of life; the listening thread does the rest."""
-        process = self._process
+        process = self.process
         if process is not None:
             self._verdict = ProcessFrozen(self._who) if is_frozen else ProcessHangs(self._who, self._patience_s())
             _log.error("%s", self._verdict)
@@ -292,18 +279,14 @@ class ProcessClient:
     def _take(self, message: object) -> None:
         watchdog = self._watchdog
         if watchdog is not None:
-            watchdog.spoken()
+            watchdog.heard(is_answer=isinstance(message, Ready | Answer))
         match message:
             case Alive():
                 pass
             case Ready():
                 self.status, self._is_loading = "ready", False
-                if watchdog is not None:
-                    watchdog.answered()
             case Answer(number, value, error):
-                self._deaths, self._is_warm = 0, True
-                if watchdog is not None:
-                    watchdog.answered()
+                self._deaths, self.is_warm = 0, True
                 self._settle(number, value, error)
             case Logged(level, name, text):
                 logging.getLogger(name).log(level, "%s", text)
@@ -311,7 +294,7 @@ class ProcessClient:
                 self._settle(number)
             case _:
                 try:
-                    self._on_event(message)
+                    self.on_event(message)
                 except Exception:
                     _log.exception("what the %s told could not be used", self._who)
 
@@ -396,13 +379,11 @@ class Watchdog:
         self._silent_s = self._waited_s = 0.0
         threading.Thread(target=self._watch, name=f"watchdog-{pid}", daemon=True).start()
 
-    def spoken(self) -> None:
-        """The process has sent something."""
+    def heard(self, *, is_answer: bool) -> None:
+        """The process has sent something, which may answer somebody."""
         self._has_spoken = True
-
-    def answered(self) -> None:
-        """The process has answered somebody."""
-        self._has_answered = True
+        if is_answer:
+            self._has_answered = True
 
     def stop(self) -> None:
         """Watch no more."""

@@ -25,6 +25,7 @@ from app.processes.messages.photo_messages import (
 )
 from app.processes.server import ProcessServer
 from osfcore.errors import CorruptFile, OsfError
+from osfcore.io.image_file import encode_png
 
 if TYPE_CHECKING:
     from osfcore.photo.read_photograph import RawPhotograph
@@ -94,12 +95,10 @@ def _encoded(kind: str, picture: np.ndarray, options: list[int] | None = None) -
 
 
 def _mask(order: FindMask) -> MaskFound:
-    from osfcore.io.image_file import encode_png
     from osfcore.photo.segmentation import propose_mask
 
-    decoded = cv2.imdecode(np.frombuffer(order.jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert decoded is not None
-    picture, mark = np.ascontiguousarray(decoded[..., ::-1]), order.mark
+    picture, mark = cv2.imdecode(np.frombuffer(order.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB), order.mark
+    assert picture is not None
     add, remove = _painted(mark, picture.shape[:2])
     clicks = (np.reshape(np.array(points, float), (-1, 2)) for points in (mark.on, mark.off))
     mask = propose_mask(picture, mark.box, *clicks, add=add, remove=remove)

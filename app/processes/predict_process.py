@@ -5,7 +5,6 @@ Only `predictor_main` is imported by the web process, by name; torch loads in th
 
 from __future__ import annotations
 
-import os
 import time
 from collections import OrderedDict
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from app.processes.messages.neural_messages import Order, Predicted, PredictPushes
 from app.processes.server import IsOvertaken, ProcessServer
 from osfcore.errors import OsfError
-from osfcore.fields.field_library import FIELD_FILE, FieldLibrary
+from osfcore.fields.field_library import FieldLibrary
 from osfcore.paper.method import Method
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ class PushPredictor:
             from osfcore.dynamics.rollout import network_path as network
 
         chosen = tuple(sorted(names))
-        stamps = [_stamp(self._fields.folder(name) / FIELD_FILE) for name in chosen]
+        stamps = [self._fields.stamp(name) for name in chosen]
         key = (method, chosen, *stamps, _stamp(network(self._data_dir)))
         if key not in self._models:
             self._models[key] = load(self._data_dir, self._fields, chosen)
@@ -82,9 +81,9 @@ class PushPredictor:
 
 
 def _stamp(path: Path) -> object:
-    """Changes when a file is written again or deleted; what ships with the program has none here and stays."""
+    """Changes when a file is written again or deleted."""
     try:
-        status = os.stat(path)
+        status = path.stat()
     except OSError:
         return None
     return status.st_mtime_ns, status.st_size

@@ -8,7 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from osfcore.geometry.cameras import MAX_IMAGE_SIDE, MIN_IMAGE_SIDE, Camera, default_cameras, goal_camera
+from osfcore.errors import check_known
+from osfcore.geometry.cameras import MAX_IMAGE_SIDE, MIN_IMAGE_SIDE, Camera, default_cameras, goal_camera, image_side
 from osfcore.geometry.poses import Pose
 
 _FARTHEST_M = 100.0
@@ -18,8 +19,15 @@ BAND_PIXELS = 50_000  # some tenths of a second
 
 
 def scene_camera(name: str, size: int) -> Camera:
-    """One of the cameras that every scene has, "0" to "3" or "goal", with images of a size [px]."""
-    return next(camera for camera in (*default_cameras(size), goal_camera(size)) if camera.name == name)
+    """One of the cameras that every scene has, "0" to "3" or "goal", with images of a size [px].
+
+    Raises:
+        InvalidInput: if there can be no images of this size.
+        UnknownName: if there is no such camera.
+    """
+    cameras = {camera.name: camera for camera in (*default_cameras(image_side(size)), goal_camera(size))}
+    check_known("camera", [name], cameras)
+    return cameras[name]
 
 
 def view_camera(position: object, quaternion: object, fov_y_rad: float, aspect: float, rows: int) -> Camera | None:

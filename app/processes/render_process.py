@@ -6,11 +6,12 @@ Only `renderer_main` is imported by the web process, by name; compiled code load
 from __future__ import annotations
 
 import os
-from collections import OrderedDict
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -25,21 +26,24 @@ from app.processes.messages.neural_messages import (
 )
 from app.processes.render_cameras import bands
 from app.processes.server import IsOvertaken, ProcessServer
+from osfcore.estimation.camera_response import linear_from_encoded, srgb_of_linear
+from osfcore.estimation.steps import ContentCheck
 from osfcore.fields.field_library import TABLE_NAME, FieldLibrary
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.states import Observation, SceneState
 from osfcore.io.image_file import encode_png, to_uint8
+from osfcore.render.types import EXACT, PLANNING, Quality, SceneBatch
 
 if TYPE_CHECKING:
     from osfcore.estimation.content_check import ContentChecker
-    from osfcore.estimation.steps import ContentCheck
     from osfcore.fields.kiloosf import KiloOSF
-    from osfcore.geometry.cameras import Camera
-    from osfcore.geometry.states import SceneState
     from osfcore.render.renderer import SceneRenderer
-    from osfcore.render.types import Quality
 
 DIFFERENCE_GAIN = 4  # as in the pictures that a training shows
 _NICENESS = 5  # the simulation, and what serves the page, come first
 _MOST_RENDERERS = 4
+# Cameras blend what falls into one pixel, so a fair comparison does so too.
+_COMPARED = replace(EXACT, samples_per_side=2)
 
 
 def renderer_main(server: ProcessServer, data_dir: Path) -> None:
@@ -53,8 +57,10 @@ class NeuralRenderer:
 
     def __init__(self, fields: FieldLibrary) -> None:
         self._fields = fields
-        self._renderers: OrderedDict[object, SceneRenderer] = OrderedDict()
-        self._latest_checker: tuple[object, ContentChecker] | None = None
+        # Both are found by the names of objects and the stamps of their files. A photo is checked when it comes, or
+        # when the table changes, so one checker is enough.
+        self._renderer = lru_cache(_MOST_RENDERERS)(self._new_renderer)
+        self._checker = lru_cache(1)(self._new_checker)
 
     def render(
         self, order: Order, is_overtaken: IsOvertaken = lambda: False
@@ -78,8 +84,6 @@ class NeuralRenderer:
                 raise TypeError(f"{type(order).__name__} is no picture")
 
     def _draw(self, order: DrawView, is_overtaken: IsOvertaken) -> DrawnView | None:
-        from osfcore.render.types import EXACT, PLANNING
-
         quality, outputs = (EXACT, {"rgb", "depth"}) if order.is_sharp else (PLANNING, {"rgb"})
         images, depths = [], []
         for band in bands(order.camera):
@@ -92,12 +96,9 @@ class NeuralRenderer:
 
     def _compare(self, order: CompareView) -> Comparison:
         from osfcore.metrics.image_errors import psnr
-        from osfcore.render.types import EXACT
 
         pixels = _decoded(order.observed)
-        # Cameras blend what falls into one pixel, so a fair comparison does so too.
-        quality = replace(EXACT, samples_per_side=2)
-        rgb, _ = self._picture(order.state, order.camera, quality, {"rgb"})
+        rgb, _ = self._picture(order.state, order.camera, _COMPARED, {"rgb"})
         observed, rendered = pixels / np.float32(255), np.clip(rgb, 0, 1)
         difference = to_uint8(DIFFERENCE_GAIN * np.abs(rendered - observed))
         shown = to_uint8(rendered)
@@ -105,16 +106,10 @@ class NeuralRenderer:
         return Comparison(encode_png(shown), encode_png(difference), encode_png(side_by_side), psnr(observed, rendered))
 
     def _photograph(self, order: DrawPhoto) -> bytes:
-        import cv2
-
-        from osfcore.estimation.camera_response import linear_from_encoded, srgb_of_linear
-        from osfcore.render.types import EXACT
-
         def sized(picture: np.ndarray) -> np.ndarray:
             return cv2.resize(picture, (order.camera.width, order.camera.height), interpolation=cv2.INTER_AREA)
 
-        quality = replace(EXACT, samples_per_side=2)
-        rgb, _ = self._picture(order.state, order.camera, quality, {"rgb"})
+        rgb, _ = self._picture(order.state, order.camera, _COMPARED, {"rgb"})
         photo = linear_from_encoded(sized(_decoded(order.photo)) / 255, "srgb")
         shown = np.any([sized(_decoded(mask))[..., 0] > 127 for mask in order.masks], axis=0)
         if shown.any():  # the exposure of the photo is not known
@@ -122,52 +117,36 @@ class NeuralRenderer:
         return encode_png(to_uint8(srgb_of_linear(np.clip(rgb, 0, 1))))
 
     def _check(self, order: CheckPhoto) -> ContentCheck:
-        from osfcore.geometry.states import Observation
-
         image = _decoded(order.photo)[None] / np.float32(255)
         observation = Observation((order.camera,), image, order.state.names, None, None, 0.0)
-        return self._checker(order.state.names).check(observation, order.state)
+        return self._checker(*self._key(order.state.names)).check(observation, order.state)
 
     def _picture(
         self, state: SceneState, camera: Camera, quality: Quality, outputs: set[str]
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        from osfcore.render.types import SceneBatch
-
-        drawn = self._renderer(state.names).render(SceneBatch.of(state), (camera,), quality=quality, outputs=outputs)
+        renderer = self._renderer(*self._key(state.names))
+        drawn = renderer.render(SceneBatch.of(state), (camera,), quality=quality, outputs=outputs)
         return drawn.rgb[0, 0], None if drawn.depth is None else drawn.depth[0, 0]
 
-    def _renderer(self, names: tuple[str, ...]) -> SceneRenderer:
+    def _new_renderer(self, names: tuple[str, ...], *_: object) -> SceneRenderer:
         from osfcore.render.renderer import SceneRenderer
 
-        key = self._key(names)
-        if key not in self._renderers:
-            self._renderers[key] = SceneRenderer(self._load(names), self._fields.load_table())
-            while len(self._renderers) > _MOST_RENDERERS:
-                self._renderers.popitem(last=False)
-        self._renderers.move_to_end(key)
-        return self._renderers[key]
+        return SceneRenderer(self._load(names), self._fields.load_table())
 
-    def _checker(self, names: tuple[str, ...]) -> ContentChecker:
-        """That of the latest objects only: a photo is checked when it comes, or when the table changes."""
+    def _new_checker(self, names: tuple[str, ...], *_: object) -> ContentChecker:
         from osfcore.estimation.content_check import ContentChecker
         from osfcore.estimation.objective import ObjectModels
 
-        key = self._key(names)
-        if self._latest_checker is None or self._latest_checker[0] != key:
-            models = ObjectModels(self._load(names), self._fields.load_table())
-            self._latest_checker = key, ContentChecker(models)
-        return self._latest_checker[1]
+        return ContentChecker(ObjectModels(self._load(names), self._fields.load_table()))
 
     def _load(self, names: tuple[str, ...]) -> dict[str, KiloOSF]:
         return {name: self._fields.load(name) for name in names}
 
-    def _key(self, names: tuple[str, ...]) -> object:
+    def _key(self, names: tuple[str, ...]) -> tuple[Any, ...]:
         return names, *(self._fields.stamp(name) for name in (*names, TABLE_NAME))
 
 
 def _decoded(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
-    import cv2
-
     decoded = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert decoded is not None
     return decoded[..., ::-1]

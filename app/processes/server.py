@@ -93,8 +93,10 @@ class ProcessServer:
             self._connection.send(message)
 
     def show_life(self) -> None:
-        """Tell from now on, in a thread of its own, that this process lives."""
-        threading.Thread(target=self._show_life, name="alive", daemon=True).start()
+        """Tell again and again that this process lives, until the service has gone."""
+        while not self._queue.is_closed():
+            self.send(Alive())
+            time.sleep(ALIVE_S)
 
     def serve(
         self,
@@ -120,11 +122,6 @@ class ProcessServer:
             request = self._queue.take(idle(not self._queue.is_empty()))
             if request is not None:
                 self.send(self._answer(carry_out, request))
-
-    def _show_life(self) -> None:
-        while not self._queue.is_closed():
-            self.send(Alive())
-            time.sleep(ALIVE_S)
 
     def _receive(self, on_message: Callable[[object], None], on_lost: Callable[[], None]) -> None:
         with contextlib.suppress(EOFError, OSError):
@@ -182,7 +179,8 @@ def child_main(connection: Connection, target: Callable[..., None], who: str, *a
     server = ProcessServer(connection, who)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[PipeHandler(server)])
     logging.captureWarnings(True)
-    server.show_life()  # before the target loads what it needs
+    # In a thread of its own, and before the target loads what it needs.
+    threading.Thread(target=server.show_life, name="alive", daemon=True).start()
     target(server, *arguments)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -41,9 +41,10 @@ from app.processes.messages.scene_messages import (
     UndoDisturbances,
     WatchFrames,
 )
+from app.processes.render_cameras import scene_camera
 from app.processes.server import IsOvertaken, ProcessServer
-from osfcore.errors import InvalidInput, NotThere, OsfError, UnknownName
-from osfcore.geometry.cameras import Camera, default_cameras, goal_camera, image_side
+from osfcore.errors import NotThere, OsfError, check_known
+from osfcore.geometry.cameras import default_cameras, goal_camera, image_side
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import Observation, SceneState
@@ -93,7 +94,7 @@ class Simulation:
         self._records: dict[str, SceneRecord] = {}
         self._worlds: OrderedDict[str, Tabletop] = OrderedDict()
         self._time_offsets: dict[str, float] = {}
-        self._disturbances = Disturbances()
+        self._disturbances: defaultdict[str, Disturbance] = defaultdict(Disturbance)
         self._shown: str | None = None
         self._frames_wanted = False
         self._frames_due = False
@@ -146,21 +147,24 @@ class Simulation:
                 return record
             case DropScene(scene):
                 self._records.pop(scene, None)
-                self._disturbances.forget(scene)
+                self._disturbances.pop(scene, None)
                 self._forget_world(scene)
             case ResetScene(scene):
                 record = self._record(scene)
-                self._disturbances.forget(scene)
-                return self._put(record, record.initial, time_s=0.0)
+                self._disturbances.pop(scene, None)
+                self._world(scene).load(record.initial)
+                self._time_offsets[scene] = 0.0
+                return self._report(record)
             case EditScene():
                 return self._edit(command)
             case Act(scene, actions):
                 return self._act(scene, tuple(check_action(a) for a in actions))
             case Disturb(scene, camera):
                 self._report(self._record(scene))  # new pictures are due
-                return self._disturbances.toggle(scene, camera)
+                self._disturbances[scene] = self._disturbances[scene].toggled(camera)
+                return self._disturbances[scene]
             case UndoDisturbances(scene):
-                if self._disturbances.forget(scene):
+                if self._disturbances.pop(scene, Disturbance()) != Disturbance():
                     self._report(self._record(scene))
             case TakeImage():
                 return image_png(self._world(command.id), command)
@@ -241,11 +245,6 @@ class Simulation:
 
     # Changes
 
-    def _put(self, record: SceneRecord, state: SceneState, *, time_s: float) -> SceneRecord:
-        self._world(record.id).load(state)
-        self._time_offsets[record.id] = time_s
-        return self._report(record)
-
     def _edit(self, command: EditScene) -> SceneRecord:
         record, world = self._record(command.id), self._world(command.id)
         if command.poses:
@@ -263,14 +262,10 @@ class Simulation:
             ((name, pose),) = poses.items()
             world.move_object(name, pose)
             return
-        state = world.truth()
-        for name in poses:
-            if name not in state.names:
-                raise UnknownName("object on the table", name, state.names)
+        state, time_s = world.truth(), self._time_s(record.id)
+        check_known("object on the table", poses, state.names)
         every = [poses.get(name, state.pose(name)) for name in state.names]
-        stacked = Pose.stacked(every)
-        time_s = self._time_s(record.id)
-        world.load(SceneState(state.names, stacked, state.light, state.pusher))
+        world.load(replace(state, poses=Pose.stacked(every)))
         self._time_offsets[record.id] = time_s
 
     def _act(self, scene: str, actions: tuple[np.ndarray, ...]) -> SceneRecord:
@@ -307,7 +302,7 @@ class Simulation:
         cameras = (goal_camera(record.image_size),) if command.goal else default_cameras(record.image_size)
         observation = world.render(cameras, masks=command.masks, with_pusher=not command.goal)
         if not command.goal:
-            observation = self._disturbances.apply(command.id, observation)
+            observation = self._disturbances[command.id].apply(observation)
         images = to_uint8(observation.images).astype(np.float32) / 255  # as cameras deliver them
         return ObservedScene(replace(record, state=world.truth()), replace(observation, images=images))
 
@@ -339,7 +334,7 @@ class Simulation:
         record = self._records[self._shown]
         try:
             cameras = default_cameras(min(record.image_size, MAX_FRAME_SIDE))
-            observation = self._disturbances.apply(record.id, self._world(record.id).render(cameras))
+            observation = self._disturbances[record.id].apply(self._world(record.id).render(cameras))
         except OsfError as error:
             _log.warning("no live images of scene %s: %s", record.id, error)
             return
@@ -360,7 +355,8 @@ def image_png(world: Tabletop, command: TakeImage) -> bytes:
     Raises:
         UnknownName: if there is no such camera.
     """
-    observation = world.render((_camera(command),), masks=command.masks, with_pusher=command.pusher)
+    camera = scene_camera(command.camera, command.size)
+    observation = world.render((camera,), masks=command.masks, with_pusher=command.pusher)
     pixels = to_uint8(observation.images[0])
     return encode_png(pixels if observation.masks is None else tint_masks(pixels, observation.masks[0]))
 
@@ -371,20 +367,11 @@ def mask_png(world: Tabletop, command: TakeMask) -> bytes:
     Raises:
         UnknownName: if there is no such camera or object.
     """
-    camera = _camera(command)
-    if command.object not in world.names:
-        raise UnknownName("object on the table", command.object, world.names)
+    camera = scene_camera(command.camera, command.size)
+    check_known("object on the table", [command.object], world.names)
     masks = world.render((camera,), masks=True).masks
-    if masks is None:
-        raise InvalidInput("renderer", "without masks", "one that makes masks")
+    assert masks is not None, "they are asked for"
     return encode_png(masks[0][world.names.index(command.object)].astype(np.uint8) * 255)
-
-
-def _camera(command: TakeImage | TakeMask) -> Camera:
-    cameras = {c.name: c for c in (*default_cameras(image_side(command.size)), goal_camera(command.size))}
-    if command.camera not in cameras:
-        raise UnknownName("camera", command.camera, cameras)
-    return cameras[command.camera]
 
 
 # What people do to the pictures of a scene to see whether the program notices: dim the light, cover a camera
@@ -415,27 +402,8 @@ class Disturbance:
                 images[view] = 0
         return replace(observation, images=images)
 
-
-class Disturbances:
-    """What is done to each scene now."""
-
-    def __init__(self) -> None:
-        self._of: dict[str, Disturbance] = {}
-
-    def toggle(self, scene: str, camera: str | None) -> Disturbance:
+    def toggled(self, camera: str | None) -> Disturbance:
         """Cover a camera, or dim the light for None; undo it where that, or any camera, is so already."""
-        now = self._of.get(scene, Disturbance())
         if camera is None:
-            then = replace(now, brightness=DIMMED if now.brightness == 1.0 else 1.0)
-        else:
-            then = replace(now, covered=frozenset() if now.covered else frozenset({camera}))
-        self._of[scene] = then
-        return then
-
-    def forget(self, scene: str) -> bool:
-        """Back to what is there; tells whether that is another picture."""
-        return self._of.pop(scene, Disturbance()) != Disturbance()
-
-    def apply(self, scene: str, observation: Observation) -> Observation:
-        """An observation of a scene as its cameras see it."""
-        return self._of.get(scene, Disturbance()).apply(observation)
+            return replace(self, brightness=DIMMED if self.brightness == 1.0 else 1.0)
+        return replace(self, covered=frozenset() if self.covered else frozenset({camera}))

@@ -14,6 +14,7 @@ from app.jobs.params import ImageCount, ImageSize, JobParams, ObjectCount, Objec
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
 from osfcore.io.files import file_at_once
+from osfcore.objects.fetch import fetch, source_from
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
@@ -87,8 +88,6 @@ def _collect_table(params: CollectTableParams, place: JobContext) -> Iterator[An
 
 
 def _fetch_assets(params: FetchAssetsParams, place: JobContext) -> Iterator[Any]:
-    from osfcore.objects.fetch import fetch, source_from
-
     source = source_from("pypi", place.data_dir / "downloads")
     yield from fetch(tuple(params.names), source, place.library)
 

@@ -18,13 +18,16 @@ from jaxtyping import Float
 from pydantic import model_validator
 
 from app.episodes.file_names import GOAL_FILE, PREPARED_FILE, RECORDING_FILE
-from app.episodes.progress import EpisodeProgress
+from app.episodes.progress import EpisodeProgress, TimeLeft
 from app.episodes.settings import ChosenSettings, StoredSettings
 from app.jobs.job import INPUTS
 from app.jobs.kind import JobKind
 from app.jobs.params import JobParams
 from app.processes.messages.scene_messages import Act, JobCommand, ObservedScene, ObserveScene, SceneRecord, TakeView
+from osfcore.control.events import EpisodeSettings, Event, Looking, Observed, Planning, Stepped
+from osfcore.control.world import World
 from osfcore.errors import OsfError
+from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.geometry.states import Observation, SceneState
@@ -32,17 +35,15 @@ from osfcore.geometry.workspace import check_action
 from osfcore.io.files import read_json
 from osfcore.io.scene_file import CameraJson, ObjectJson
 from osfcore.paper.method import Method
+from osfcore.paper.mppi import GaussianPlanSettings
+from osfcore.planning.costs import PoseGoal
+from osfcore.planning.mppi import PlanSketch, sketch_of
 from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
     from osfcore.control.estimators import SceneModels
-    from osfcore.control.events import EpisodeSettings, Event
     from osfcore.control.goal import GoalImage
-    from osfcore.control.prepared import PreparedLooks
-    from osfcore.control.world import World
-    from osfcore.planning.costs import PoseGoal
-    from osfcore.planning.mppi import PlanSketch
 
 _STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not have to move
 
@@ -68,15 +69,11 @@ class EpisodeJobProgress(EpisodeProgress):
     @property
     def ends_round(self) -> bool:
         """Whether a round of the loop is over, so that a job that goes on by single steps rests now."""
-        from osfcore.control.events import Stepped
-
         return isinstance(self.view, Stepped)
 
     @property
     def must_be_told(self) -> bool:
         """Whether a view that misses this would show something wrong."""
-        from osfcore.control.events import Looking
-
         return self.view is not None and not isinstance(self.view, Looking)
 
 
@@ -130,11 +127,11 @@ def episode_job(params: EpisodeParams, place: JobContext) -> Iterator[EpisodeJob
         OsfError: if an object has no field, the goal does not fit, the simulation is gone, or the disk refuses.
     """
     from app.episodes.look_pictures import LookPictures
-    from app.episodes.progress import TimeLeft
     from app.episodes.record import About, EpisodeRecord, recorded
     from app.episodes.recording import write_recording
     from osfcore.control.closed_loop import Episode
     from osfcore.control.goal import GoalImage
+    from osfcore.control.prepared import prepared_from_json
     from osfcore.fields.devices import use_one_thread
 
     assert place.orders is not None, "the job's process sets it"
@@ -146,21 +143,24 @@ def episode_job(params: EpisodeParams, place: JobContext) -> Iterator[EpisodeJob
     goal, start = params.goal, world.truth()
     target = None if goal.truth is None else SceneState(names, _poses(goal.truth, names), start.light, None)
     inputs, rng = place.folder / INPUTS, stream_rng(params.seed, Stream.EPISODE)
-    wanted, prepared = _goal(goal, names, inputs), _prepared(inputs / PREPARED_FILE)
+    wanted, known = _goal(goal, names, inputs), inputs / PREPARED_FILE
+    prepared = read_json(known, prepared_from_json) if known.is_file() else None
     image = wanted if method == "paper" else None
     assert image is None or isinstance(image, GoalImage), "the service renders poses for it"
     about = About(names, params.seed, settings, target, _moved(start, target), models.symmetries, method, image)
     record = EpisodeRecord(place.folder, world, about)
     if image is None:
         loop = Episode(world, models, wanted, settings, rng, prepared=prepared)
+        events = loop.run()
     else:
-        loop = _Published(world, models, image, settings, rng)
+        loop, events = None, _published(world, models, image, settings, rng)
     progress, timer = EpisodeJobProgress(0, 0, "Looking"), TimeLeft(finds_goal=image is None)
     pictures = LookPictures(models.appearance.together, wanted)
     with contextlib.closing(record):
-        for event in recorded(loop.run(), record):
+        for event in recorded(events, record):
             for change in place.orders.changes():
-                loop.settings = ChosenSettings.of_stored(change["settings"]).of_loop()
+                if loop is not None:  # those of the paper's algorithm are fixed
+                    loop.settings = ChosenSettings.of_stored(change["settings"]).of_loop()
             share, left_s = timer.take(event, progress.total or settings.steps)
             progress = replace(
                 progress.after(event), share=share, left_s=round(left_s, 1), seconds=record.seconds,
@@ -177,7 +177,6 @@ def episode_job(params: EpisodeParams, place: JobContext) -> Iterator[EpisodeJob
 
 def _models(method: Method, names: tuple[str, ...], place: JobContext) -> SceneModels:
     from osfcore.control.estimators import load_scene_models
-    from osfcore.fields.field_library import FieldLibrary
 
     fields = FieldLibrary(place.data_dir)
     models = load_scene_models(names, fields, place.library, place.data_dir)
@@ -188,36 +187,20 @@ def _models(method: Method, names: tuple[str, ...], place: JobContext) -> SceneM
     return with_paper_stages(models, frozenset(STAGES), fields, place.data_dir)
 
 
-@dataclass(slots=True)
-class _Published:
-    """Algorithm 1 of the paper, in the place of an `Episode`.
+def _published(
+    world: World, models: SceneModels, goal: GoalImage, settings: EpisodeSettings, rng: np.random.Generator
+) -> Iterator[Event]:
+    """Algorithm 1 of the paper; of the settings, steps, samples, horizon and temperature count."""
+    from osfcore.paper.algorithm import AlgorithmSettings, run_algorithm
+    from osfcore.paper.stages import PaperEstimators
 
-    Attributes:
-        settings: of which steps, samples, horizon and temperature count; fixed once it runs.
-    """
-
-    world: World
-    models: SceneModels
-    goal: GoalImage
-    settings: EpisodeSettings
-    rng: np.random.Generator
-
-    def run(self) -> Iterator[Event]:
-        from osfcore.paper.algorithm import AlgorithmSettings, run_algorithm
-        from osfcore.paper.mppi import GaussianPlanSettings
-        from osfcore.paper.stages import PaperEstimators
-
-        plan = self.settings.plan
-        drawn = GaussianPlanSettings(plan.samples, plan.horizon, temperature=plan.temperature)
-        how = AlgorithmSettings(self.settings.steps, drawn)
-        return run_algorithm(self.world, self.models, self.goal, how, PaperEstimators(), self.rng)
+    plan = settings.plan
+    drawn = GaussianPlanSettings(plan.samples, plan.horizon, temperature=plan.temperature)
+    return run_algorithm(world, models, goal, AlgorithmSettings(settings.steps, drawn), PaperEstimators(), rng)
 
 
 def _drawn(event: Event) -> Event | PlanSketch | None:
     """Return what a picture shows of an event."""
-    from osfcore.control.events import Observed, Planning
-    from osfcore.planning.mppi import sketch_of
-
     match event:
         case Observed():  # its images are on the page already
             return None
@@ -231,7 +214,6 @@ def _goal(given: EpisodeGoal, names: tuple[str, ...], inputs: Path) -> GoalImage
     """The goal image among the inputs, or the poses in the parameters, with a photograph of them if there is one."""
     from app.episodes.request import read_goal
     from osfcore.control.goal import PhotoGoal
-    from osfcore.planning.costs import PoseGoal
 
     image = None if given.camera is None else read_goal(inputs / GOAL_FILE, given.camera.camera())
     if given.poses is None:
@@ -241,18 +223,10 @@ def _goal(given: EpisodeGoal, names: tuple[str, ...], inputs: Path) -> GoalImage
     return PoseGoal(names, poses) if image is None else PhotoGoal(names, poses, image)
 
 
-def _prepared(path: Path) -> PreparedLooks | None:
-    """What was found out beforehand about an example, if the goal is an example's."""
-    from osfcore.control.prepared import prepared_from_json
-
-    return read_json(path, prepared_from_json) if path.is_file() else None
-
-
 def _poses(entries: tuple[ObjectJson, ...], names: tuple[str, ...]) -> Pose:
     """Poses in the order of `names`."""
-    by_name = {entry.name: entry for entry in entries}
-    ordered = [by_name[name] for name in names]
-    return Pose(np.array([entry.position for entry in ordered]), np.array([entry.quaternion for entry in ordered]))
+    by_name = {entry.name: entry.pose() for entry in entries}
+    return Pose.stacked(by_name[name] for name in names)
 
 
 def _moved(start: SceneState, target: SceneState | None) -> tuple[str, ...]:
@@ -269,9 +243,6 @@ def _moved(start: SceneState, target: SceneState | None) -> tuple[str, ...]:
 # The page's table as a world: what an episode in a job's process sees and does there
 
 
-Ask = Callable[[JobCommand], Any]
-
-
 class RemoteWorld:
     """A scene of the service, by way of the process that simulates it.
 
@@ -282,7 +253,7 @@ class RemoteWorld:
         scene: identifier.
     """
 
-    def __init__(self, ask: Ask, scene: str) -> None:
+    def __init__(self, ask: Callable[[JobCommand], Any], scene: str) -> None:
         self._ask, self._scene = ask, scene
         self.record: SceneRecord | None = None  # the truth of the last moment; for reports, not for estimates
 
@@ -332,13 +303,7 @@ class RemoteWorld:
 
 
 EPISODE = JobKind(
-    "episode",
-    "episode",
-    episode_job,
-    EpisodeParams,
-    preloads=(
-        "osfcore.world.tabletop", "osfcore.control.closed_loop", "osfcore.control.estimators",
-    ),
-    uses_physics=True,
-    keeps_steps=True,
+    "episode", "episode", episode_job, EpisodeParams,
+    preloads=("osfcore.world.tabletop", "osfcore.control.closed_loop", "osfcore.control.estimators"),
+    uses_physics=True, keeps_steps=True,
 )  # fmt: skip

@@ -18,17 +18,19 @@ import numpy as np
 from app.jobs.job import INPUTS
 from app.jobs.kind import JobKind
 from app.jobs.params import JobParams
-from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
+from osfcore.errors import CorruptFile, InvalidInput
+from osfcore.estimation.steps import EstimateStep
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.states import Observation, SceneState
+from osfcore.io.files import writing
 from osfcore.io.json_codec import decode
-from osfcore.io.scene_file import StateJson, state_to_json
+from osfcore.io.scene_file import StateJson, read_estimated, state_to_json, write_estimated
 from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
     from osfcore.estimation.objective import ObjectModels
-    from osfcore.estimation.steps import EstimateStep
-    from osfcore.geometry.states import Observation, SceneState
 
 Mode = Literal["first", "next", "goal"]
 OBSERVATION, PRIOR, TRUTH = "observation", "prior.json", "truth.json"
@@ -88,17 +90,18 @@ def estimate_job(params: EstimateParams, place: JobContext) -> Iterator[Estimati
         OsfError: if the observation does not fit the mode, an object has no field, or the disk refuses.
     """
     from osfcore.io.observation_file import read_observation
-    from osfcore.io.scene_file import read_estimated, write_estimated
 
     yield Estimating(0, 0, "Loading fields, half a minute the first time")
     inputs = place.folder / INPUTS
     observation = read_observation(inputs / OBSERVATION)
-    mode = params.mode
-    prior = None if mode == "first" else read_estimated(inputs / PRIOR).state
+    prior = None if params.mode == "first" else read_estimated(inputs / PRIOR).state
     models = load_models(place.data_dir, observation.names, params.method)
     rng = stream_rng(params.seed, Stream.FIRST_FRAME)
-    for number, step in enumerate(steps_of(mode, models, observation, prior, rng, params.method), 1):
-        progress = _progress_of(number, step)
+    for number, step in enumerate(steps_of(params.mode, models, observation, prior, rng, params.method), 1):
+        trusted = None if step.estimate is None else step.estimate.trusted
+        losses, loss = tuple(_number(loss) for loss in step.losses), _number(step.loss)
+        at = step.progress
+        progress = Estimating(at.done, at.total, at.note, number, step.stage, losses, loss, trusted, step)
         _keep(place.folder / STEPS, progress, step.state)
         if step.estimate is not None:
             write_estimated(place.folder / STATE, step.estimate)
@@ -118,7 +121,6 @@ def load_models(data_dir: Path, names: tuple[str, ...], method: Method = "ours")
         CorruptFile: if a field is broken.
     """
     from osfcore.estimation.objective import ObjectModels
-    from osfcore.fields.field_library import FieldLibrary
 
     library = FieldLibrary(data_dir)
     if method == "paper":
@@ -196,15 +198,6 @@ def state_of_step(step: dict[str, Any]) -> SceneState:
     return decode(StateJson, step["guess"], "guess").state()
 
 
-def _progress_of(number: int, step: EstimateStep) -> Estimating:
-    progress = step.progress
-    trusted = None if step.estimate is None else step.estimate.trusted
-    losses = tuple(_number(loss) for loss in step.losses)
-    return Estimating(
-        progress.done, progress.total, progress.note, number, step.stage, losses, _number(step.loss), trusted, step
-    )
-
-
 def _number(value: float) -> float | None:
     """JSON has neither NaN nor infinity."""
     return float(value) if math.isfinite(value) else None
@@ -213,18 +206,10 @@ def _number(value: float) -> float | None:
 def _keep(path: Path, progress: Estimating, state: SceneState) -> None:
     names = ("done", "total", "note", "step", "stage", "losses", "loss")
     line = json.dumps({**{name: getattr(progress, name) for name in names}, "guess": state_to_json(state)})
-    try:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error
+    with writing(path), path.open("a", encoding="utf-8") as file:
+        file.write(line + "\n")
 
 
 ESTIMATE = JobKind(
-    "estimate",
-    "estimate",
-    estimate_job,
-    EstimateParams,
-    preloads=("osfcore.control.estimators", "app.jobs.kinds.estimates"),
-    ends_at_once=True,
+    "estimate", "estimate", estimate_job, EstimateParams, preloads=("osfcore.control.estimators",), ends_at_once=True
 )

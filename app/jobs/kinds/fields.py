@@ -20,15 +20,16 @@ from app.jobs.job import Job
 from app.jobs.kind import JobKind
 from app.jobs.params import Identifier, ImageCount, JobParams, ObjectName, Seed
 from app.storage.field_files import clear_workshop, install, install_published, open_workshop
-from osfcore.errors import CannotWrite, CorruptFile
+from osfcore.errors import CorruptFile
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldLibrary
-from osfcore.io.files import write_atomically
+from osfcore.fields.kiloosf import read_field
+from osfcore.io.files import write_atomically, writing
 from osfcore.io.image_file import write_png
 from osfcore.paper.method import Method, own_field_path
+from osfcore.progress import Progress
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
-    from osfcore.fields.train_osf import FieldStep
 
 PREVIEW, COMPARISON = "preview.png", "comparison.png"
 _COMPARING = "Comparing it with the field that is there"
@@ -75,13 +76,10 @@ class TrainFieldParams(JobParams):
 
 
 @dataclass(frozen=True, slots=True)
-class TrainingStep:
-    """How far the job is.
+class TrainingStep(Progress):
+    """How far the job is, in seconds of work, about; while training, the note has PSNR and time left.
 
     Attributes:
-        done: seconds of work done, about.
-        total: seconds of work in all.
-        note: what is being done; while training with PSNR and time left.
         psnr_full: on held-out images [dB]; None until measured.
         psnr_mask: the same inside the silhouettes, dilated by 2 px [dB].
         previews: how many preview images were made so far, so that a page knows when to fetch the next.
@@ -91,9 +89,6 @@ class TrainingStep:
         left_s: time left, over all parts [s].
     """
 
-    done: int
-    total: int
-    note: str
     psnr_full: float | None = None
     psnr_mask: float | None = None
     previews: int = 0
@@ -121,7 +116,8 @@ def train_field_job(params: TrainFieldParams, place: JobContext) -> Iterator[Tra
 
 
 def _trained(params: TrainFieldParams, place: JobContext) -> Iterator[TrainingStep]:
-    name, mesh, images = params.name, params.source.mesh, _image_count(params, place)
+    name, mesh = params.name, params.source.mesh
+    images = params.images if mesh else len(list(_uploaded(params.source, place).glob("*/*.png")))
     collect_s = _START_S + round(_TAKE_S * images) if mesh else _START_S
     train_s = _CARVE_S + max(1, round(60 * params.minutes)) + round(_MEASURE_S * images)
     compare_s = round(_COMPARE_S * images) if _is_compared(name, params.method, place) else 0
@@ -135,9 +131,8 @@ def _trained(params: TrainFieldParams, place: JobContext) -> Iterator[TrainingSt
         data = _uploaded(params.source, place)
     step = replace(step, done=collect_s)
     if not (shop / METRICS_FILE).is_file():  # it is written last
-        begin = step
-        files = data, shop / FIELD_FILE, place.folder / PREVIEW
-        for step in _train(params, files, begin, train_s - _CARVE_S - round(_MEASURE_S * images)):
+        begin, optimise_s = step, train_s - _CARVE_S - round(_MEASURE_S * images)
+        for step in _train(params, data, shop / FIELD_FILE, place.folder / PREVIEW, begin, optimise_s):
             yield step
     metrics = json.loads((shop / METRICS_FILE).read_text(encoding="utf-8"))
     step = replace(step, done=collect_s + train_s, psnr_full=metrics["psnr_full"], psnr_mask=metrics["psnr_mask"])
@@ -163,7 +158,6 @@ def _is_compared(name: str, method: Method, place: JobContext) -> bool:
 
 def _compared(step: TrainingStep, name: str, data: Path, shop: Path, place: JobContext) -> TrainingStep:
     """Both fields on all held-out images; pictures of some, side by side, go to the job's folder."""
-    from osfcore.fields.kiloosf import read_field
     from osfcore.fields.train_osf import Holdout
     from osfcore.io.image_set import read_image_set
 
@@ -183,13 +177,6 @@ def _compared(step: TrainingStep, name: str, data: Path, shop: Path, place: JobC
 def _uploaded(source: FieldSource, place: JobContext) -> Path:
     assert source.set is not None, "it is one or the other"
     return place.data_dir / "sets" / source.set / "images"
-
-
-def _image_count(params: TrainFieldParams, place: JobContext) -> int:
-    """How many images are taken, or are in the uploaded set."""
-    if params.source.mesh:
-        return params.images
-    return len(list(_uploaded(params.source, place).glob("*/*.png")))
 
 
 def _order(params: TrainFieldParams, place: JobContext) -> dict[str, Any]:
@@ -213,12 +200,21 @@ def _collect(
 
 
 def _train(
-    params: TrainFieldParams, files: tuple[Path, Path, Path], begin: TrainingStep, train_s: int
+    params: TrainFieldParams, data: Path, out: Path, preview: Path, begin: TrainingStep, train_s: int
 ) -> Iterator[TrainingStep]:
-    """Train for about `train_s`; `files` are the images, the field and a preview of it."""
-    data, out, preview = files
+    """Train a field with the images in `data`, by the method that is asked for, for about `train_s`."""
+    if params.method == "paper":
+        from osfcore.fields.train_osf import FieldSettings
+        from osfcore.paper.train_fields import train_paper_field
+
+        steps = train_paper_field(FieldSettings(data, out, minutes=params.minutes, seed=params.seed))
+    else:
+        from osfcore.fields.train_kiloosf import TrainField, train_field
+
+        config = TrainField(data, out, minutes=params.minutes, seed=params.seed, hollow=params.hollow)
+        steps = train_field(config)
     previews = 0
-    for step in _learning(params, data, out):
+    for step in steps:
         if step.preview is not None:
             write_png(preview, step.preview)
             previews += 1
@@ -233,26 +229,11 @@ def _train(
         )
 
 
-def _learning(params: TrainFieldParams, data: Path, out: Path) -> Iterator[FieldStep]:
-    """The training of the method that is asked for."""
-    minutes, seed = params.minutes, params.seed
-    if params.method == "paper":
-        from osfcore.fields.train_osf import FieldSettings
-        from osfcore.paper.train_fields import train_paper_field
-
-        return train_paper_field(FieldSettings(data, out, minutes=minutes, seed=seed))
-    from osfcore.fields.train_kiloosf import TrainField, train_field
-
-    return train_field(TrainField(data, out, minutes=minutes, seed=seed, hollow=params.hollow))
-
-
 def _offer(shop: Path, folder: Path, name: str) -> None:
     """Copy what was made to where the job's files can be downloaded from."""
-    try:
+    with writing(folder):
         for file in (FIELD_FILE, METRICS_FILE):
             write_atomically(folder / f"{name}{Path(file).suffix}", (shop / file).read_bytes())
-    except OSError as error:
-        raise CannotWrite(folder, error.strerror or str(error)) from error
 
 
 def _clear(data_dir: Path, job: Job, others: Sequence[Job]) -> None:

@@ -13,11 +13,11 @@ from app.jobs.kind import JobKind
 from app.jobs.params import JobParams
 from app.processes.child_process import limit_memory
 from osfcore.errors import InvalidInput, OsfError
-from osfcore.objects.fetch import NewObject
+from osfcore.objects.fetch import NewObject, make_asset
+from osfcore.progress import Progress
 
 if TYPE_CHECKING:
     from app.jobs.context import JobContext
-    from osfcore.objects.mesh import WrongMeshSize
 
 UPLOAD = "mesh"  # in the inputs of the job
 _MEMORY_BYTES = 4 << 30  # 200,000 triangles with the largest texture take 2.5 GB
@@ -32,21 +32,15 @@ class MeshRefused(OsfError):
 
 
 @dataclass(frozen=True, slots=True)
-class AddingStep:
+class AddingStep(Progress):
     """How far the job is.
 
     Attributes:
-        done: steps finished.
-        total: steps in all.
-        note: what is being done.
         name: of the object.
         size_m: extents of its bounding box [m]; None until it has been measured.
         faces: its number of triangles; None until then.
     """
 
-    done: int
-    total: int
-    note: str
     name: str
     size_m: tuple[float, ...] | None = None
     faces: int | None = None
@@ -81,7 +75,6 @@ def add_object_job(params: AddObjectParams, place: JobContext) -> Iterator[Addin
 
 
 def _added(new: NewObject, file_name: str, place: JobContext) -> Iterator[AddingStep]:
-    from osfcore.objects.fetch import make_asset
     from osfcore.objects.mesh import read_mesh, unpack_mesh
 
     inputs = place.folder / INPUTS
@@ -113,17 +106,13 @@ def _plain(error: OsfError, new: NewObject, inputs: str) -> str:
     from osfcore.objects.mesh import WrongMeshSize
 
     if isinstance(error, WrongMeshSize):
-        return _about_size(error, new.scale)
+        raw = error.longest_m / new.scale
+        fitting = [unit for metres, unit in _UNITS if _LIKELY_M[0] <= raw * metres <= _LIKELY_M[1]]
+        advice = f"choose the unit {fitting[0]}" if fitting else "choose another unit or scale"
+        return f"The mesh is {_length(error.longest_m)} long, but it must be between 5 mm and 1 m; {advice}."
     text = str(error).replace(f"{inputs}/unpacked/mesh.glb", "the uploaded mesh")
     text = text.replace(f"{inputs}/unpacked/", "").replace(f"{inputs}/{UPLOAD}", "the uploaded file")
     return text[:1].upper() + text[1:] if text.startswith("the ") else text
-
-
-def _about_size(error: WrongMeshSize, scale: float) -> str:
-    raw = error.longest_m / scale
-    fitting = [unit for metres, unit in _UNITS if _LIKELY_M[0] <= raw * metres <= _LIKELY_M[1]]
-    advice = f"choose the unit {fitting[0]}" if fitting else "choose another unit or scale"
-    return f"The mesh is {_length(error.longest_m)} long, but it must be between 5 mm and 1 m; {advice}."
 
 
 def _length(metres: float) -> str:

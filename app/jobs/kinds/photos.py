@@ -17,8 +17,11 @@ import numpy as np
 from app.jobs.job import INPUTS
 from app.jobs.kind import JobKind
 from app.jobs.params import JobParams
+from osfcore.fields.field_library import FieldLibrary
+from osfcore.geometry.poses import Pose
 from osfcore.io.files import write_json
 from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, encode
+from osfcore.progress import Progress
 from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
@@ -64,19 +67,13 @@ class PhotoParams(JobParams):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(Progress):
     """How far the job is.
 
     Attributes:
-        done: parts finished.
-        total: parts in all.
-        note: what is being done.
         found: how many objects were found so far.
     """
 
-    done: int
-    total: int
-    note: str
     found: int = 0
 
 
@@ -91,7 +88,6 @@ def photo_job(params: PhotoParams, place: JobContext) -> Iterator[Finding]:
     Raises:
         OsfError: if an object has no field, nothing can be found, or the disk refuses.
     """
-    from osfcore.fields.field_library import FieldLibrary
     from osfcore.photo.poses import PhotoModels, estimate_photo
     from osfcore.photo.summary import summarised
 
@@ -119,7 +115,6 @@ def inputs_of(number: int, sent: Path, masks: Mapping[str, Path]) -> dict[str, P
 
 
 def _photograph(folder: Path, number: int, order: PhotoInput) -> Photograph:
-    from osfcore.geometry.poses import Pose
     from osfcore.photo.read_photograph import read_photograph, to_photograph
 
     T = None if order.T_world_camera is None else Pose.from_matrix(np.array(order.T_world_camera))

@@ -22,15 +22,16 @@ from app.jobs.job import INPUTS, Job
 from app.jobs.kind import JobKind
 from app.jobs.params import JobParams
 from osfcore.contrib.robots.robot import ConnectionLost, SafetyLimits
+from osfcore.control.events import Finished, Observed, Planning
 from osfcore.errors import OsfError
 from osfcore.estimation.camera_response import srgb_of_linear
+from osfcore.geometry.states import Observation
 from osfcore.io.files import as_mapping, read_json, write_atomically, write_json
 from osfcore.io.image_file import encode_jpeg, to_uint8
 
 if TYPE_CHECKING:
-    from app.episodes.robot import DriveOrder, RobotDrive
+    from app.episodes.robot import RobotDrive
     from app.jobs.context import JobContext
-    from osfcore.geometry.states import Observation
 
 Drives = Literal["looking", "asked", "driving", "over", "lost"]
 _CANCELLED = "somebody stopped it"
@@ -87,12 +88,17 @@ def robot_job(params: RobotParams, place: JobContext) -> Iterator[RobotProgress]
     Raises:
         OsfError: if the order cannot be met, the robot does not answer or was stopped, or the disk refuses.
     """
-    from app.episodes.robot import RobotDrive
+    from app.episodes.robot import DriveOrder, RobotDrive
     from osfcore.fields.devices import use_one_thread
 
     assert place.orders is not None, "the job's process sets it"
     use_one_thread()
-    order, may_move = _order(params, place), threading.Event()
+    limits = SafetyLimits(params.box, params.top_speed_m_s)
+    order = DriveOrder(
+        params.url, params.names, place.folder / INPUTS / GOAL_FILE, place.folder, place.data_dir, params.goal_camera,
+        boxes=params.boxes, limits=limits, seed=params.seed, settings=params.settings.of_loop(),
+    )  # fmt: skip
+    may_move = threading.Event()
     progress = RobotProgress(0, order.settings.steps, "Loading fields, half a minute the first time")
     yield progress
     try:
@@ -112,8 +118,6 @@ def robot_job(params: RobotParams, place: JobContext) -> Iterator[RobotProgress]
 def _driven(
     drive: RobotDrive, progress: RobotProgress, may_move: threading.Event, place: JobContext
 ) -> Iterator[RobotProgress]:
-    from osfcore.control.events import Finished, Observed, Planning
-
     assert place.orders is not None
     progress = replace(progress, doubts=drive.doubts)
     for event in drive.run():
@@ -131,17 +135,6 @@ def _driven(
                     may_move.set()
             progress = replace(progress, drives="driving")
             yield progress
-
-
-def _order(params: RobotParams, place: JobContext) -> DriveOrder:
-    from app.episodes.robot import DriveOrder
-
-    goal: Path = place.folder / INPUTS / GOAL_FILE
-    limits = SafetyLimits(params.box, params.top_speed_m_s)
-    return DriveOrder(
-        params.url, params.names, goal, place.folder, place.data_dir, params.goal_camera,
-        boxes=params.boxes, limits=limits, seed=params.seed, settings=params.settings.of_loop(),
-    )  # fmt: skip
 
 
 def _stopped(job: Job, folder: Path) -> Job:
