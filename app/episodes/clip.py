@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -35,14 +35,9 @@ SIDE = 412  # of the two pictures
 _GOAL, _NOW = (1468, 160), (1468, 628)
 _CURVE = (40, 852, 1396, 188)
 _PLOT = (180, 884, 1080, 122)  # within it
-_GROUND, _PANEL, _TEXT, _MUTED, _ACCENT, _WARM = (
-    (19, 21, 23),
-    (27, 30, 33),
-    (233, 231, 226),
-    (155, 162, 169),
-    (99, 184, 194),
-    (240, 172, 48),
-)
+_GROUND, _PANEL = (19, 21, 23), (27, 30, 33)
+_TEXT, _MUTED = (233, 231, 226), (155, 162, 169)
+_ACCENT, _WARM = (99, 184, 194), (240, 172, 48)
 TITLE = "Show a photo, and the table becomes it"
 SUBTITLE = "Object-centric neural scattering functions: poses and light from images alone"
 
@@ -182,15 +177,6 @@ _PLAN_Z_M = 0.012  # above the table, at which ways of the pusher are drawn
 _MOST_DOTS = 60  # candidates drawn of each object
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Ghost:
-    """Golden copies of the objects where they should be."""
-
-    rgb: Float[np.ndarray, "h w 3"]
-    share: Float[np.ndarray, "h w"]
-    depth: Float[np.ndarray, "h w"]
-
-
 class SceneView:
     """Draws one episode from one place.
 
@@ -208,9 +194,8 @@ class SceneView:
         self._size = width, height
         self._parts = _cameras(width, height)
         self._small = _cameras(width // _SMALLER, height // _SMALLER)
-        self._ghost: _Ghost | None = None
+        self._copies: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # golden ones: rgb, coverage, depth
         self._outlines: list[np.ndarray] = []
-        self._depth = np.zeros((height, width), np.float32)
 
     def show_goal(self, names: tuple[str, ...], goal: Pose, moved: np.ndarray, light: Light) -> None:
         """From now on golden copies of the objects that are to move stand where they should be."""
@@ -219,16 +204,17 @@ class SceneView:
             return
         poses = Pose(goal.position[moved], goal.quaternion[moved])
         rgb, coverage, depth = self._trace(SceneState(tuple(chosen), poses, light, None), self._parts, 2)
-        self._ghost = _Ghost(rgb, coverage.max(axis=0), depth)
-        self._outlines = [contour for share in coverage for contour in _contours(share)]
+        self._copies = rgb, coverage.max(axis=0), depth
+        self._outlines = _contours(coverage)
 
     def scene(self, state: SceneState) -> UInt8[np.ndarray, "h w 3"]:
         """The scene, with golden copies where they are visible."""
         rgb, _, depth = self._trace(state, self._parts, 2)
         rgb[~np.isfinite(depth)] = _BACKDROP
-        if self._ghost is not None:
-            seen = np.where(self._ghost.depth < depth - _HIDDEN_M, _GHOST * self._ghost.share, 0)[..., None]
-            glow = 0.35 + 0.65 * self._ghost.rgb.mean(axis=-1, keepdims=True)
+        if self._copies is not None:
+            copies_rgb, share, copies_depth = self._copies
+            seen = np.where(copies_depth < depth - _HIDDEN_M, _GHOST * share, 0)[..., None]
+            glow = 0.35 + 0.65 * copies_rgb.mean(axis=-1, keepdims=True)
             rgb = (1 - seen) * rgb + seen * glow * np.array(GOLD, np.float32) / 255
         image = to_uint8(rgb)
         cv2.polylines(image, self._outlines, isClosed=True, color=GOLD, thickness=2, lineType=cv2.LINE_AA)
@@ -238,13 +224,12 @@ class SceneView:
         """The image with the estimator at work: candidates as dots, its best guess as outlines."""
         colour = CYAN if look.look == "first" else GOLD
         dots = image.copy()
-        for position in look.candidates.position[:_MOST_DOTS].reshape(-1, 3):
-            self._dot(dots, position, colour)
+        for x, y in self._projected(look.candidates.position[:_MOST_DOTS].reshape(-1, 3)):
+            if abs(x) < 1e4 and abs(y) < 1e4:  # also false for NaN
+                cv2.circle(dots, (round(x), round(y)), 4, colour, -1, cv2.LINE_AA)
         image = cv2.addWeighted(dots, 0.55, image, 0.45, 0)
-        state = replace(look.state, pusher=None)
-        _, coverage, _ = self._trace(state, self._small, 3)
-        shares = [cv2.resize(share, self._size, interpolation=cv2.INTER_CUBIC) for share in coverage]
-        outlines = [contour for share in shares for contour in _contours(share)]
+        _, coverage, _ = self._trace(replace(look.state, pusher=None), self._small, 3)
+        outlines = _contours([cv2.resize(share, self._size, interpolation=cv2.INTER_CUBIC) for share in coverage])
         cv2.polylines(image, outlines, isClosed=True, color=colour, thickness=2, lineType=cv2.LINE_AA)
         return image
 
@@ -258,11 +243,6 @@ class SceneView:
         image = cv2.addWeighted(ways, 0.6, image, 0.4, 0)
         self._line(image, plan.best.pusher[0][:, :2], VIOLET, 4)
         return image
-
-    def _dot(self, image: np.ndarray, position: np.ndarray, colour: tuple[int, int, int]) -> None:
-        x, y = self._projected(np.asarray(position, float)[None])[0]
-        if np.isfinite([x, y]).all() and abs(x) < 1e4 and abs(y) < 1e4:
-            cv2.circle(image, (round(x), round(y)), 4, colour, -1, cv2.LINE_AA)
 
     def _line(self, image: np.ndarray, way: np.ndarray, colour: tuple[int, ...], thickness: int) -> None:
         points = self._projected(np.column_stack([way, np.full(len(way), _PLAN_Z_M)]))
@@ -296,9 +276,11 @@ def _cameras(width: int, height: int) -> tuple[Camera, ...]:
     return tuple(cameras)
 
 
-def _contours(share: Float[np.ndarray, "h w"]) -> list[np.ndarray]:
-    found = cv2.findContours((share > 0.5).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-    return [contour for contour in found if len(contour) > 12]
+def _contours(coverage: Iterable[Float[np.ndarray, "h w"]]) -> list[np.ndarray]:
+    """Outlines of objects, each given by the share of every pixel that it covers."""
+    masks = [(share > 0.5).astype(np.uint8) for share in coverage]
+    found = [cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0] for mask in masks]
+    return [contour for contours in found for contour in contours if len(contour) > 12]
 
 
 # The film, from the trajectory of an episode
@@ -377,21 +359,14 @@ def clip_of(folder: Path, library: AssetLibrary, path: Path, executor: Executor 
         raise NoClip
     meshes = {name: TracedMesh(library.load(name).mesh) for name in trajectory.names}
     photo = folder / GOAL_FILE
-    goal = _photo(photo) if photo.is_file() else _rendered(trajectory, meshes)
+    if photo.is_file():
+        with reading_png(photo, "it is no image"), Image.open(photo) as image:
+            goal = np.asarray(image.convert("RGB"))
+    else:  # it was given as poses: what the goal camera would see of them
+        wanted = SceneState(trajectory.names, trajectory.goal, trajectory.states[0].light, None)
+        goal = to_uint8(RayTracer(meshes).render(wanted, (goal_camera(SIDE),))[0].rgb)
     facts = ClipFacts.of_report(report, len(trajectory.states) - 1)
     yield from write_clip(path, trajectory, goal, meshes, facts, executor)
-
-
-def _photo(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    with reading_png(path, "it is no image"), Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
-
-
-def _rendered(trajectory: Trajectory, meshes: Mapping[str, TracedMesh]) -> UInt8[np.ndarray, "h w 3"]:
-    """What the goal camera would see of a goal that was given as poses."""
-    assert trajectory.goal is not None
-    state = SceneState(trajectory.names, trajectory.goal, trajectory.states[0].light, None)
-    return to_uint8(RayTracer(meshes).render(state, (goal_camera(SIDE),))[0].rgb)
 
 
 def write_clip(
@@ -443,44 +418,38 @@ class _Film:
         facts: ClipFacts,
         executor: Executor | None,
     ) -> None:
-        self._trajectory, self._facts = trajectory, facts
+        assert trajectory.goal is not None, "without one there is no clip"
+        self._trajectory, self._goal, self._facts = trajectory, trajectory.goal, facts
         self._clock = ReplayClock(trajectory)
         self._speed = max(1.0, self._clock.length_s / LONGEST_S)
+        self._played = max(round(FPS * self._clock.length_s / self._speed), 1)
+        self.count = self._played + round(FPS * (PAUSE_S + CARD_S))
         self._view = SceneView(meshes, *VIEW[2:], executor)
         self._goal_view = RayTracer(meshes)
-        self._layout = Layout(goal, self._far_m())
+        far_m = facts.far_m
+        if far_m is None:
+            far_m = np.array([self._distances(state).max(initial=0.0) for state in trajectory.states])
+        self._far_m, self._layout = far_m, Layout(goal, far_m)
         self._drawn: tuple[float, bool, np.ndarray, np.ndarray] | None = None
         self._shows_goal = False
 
-    @property
-    def count(self) -> int:
-        """Of the frames."""
-        return self._played + round(FPS * (PAUSE_S + CARD_S))
-
-    @property
-    def _played(self) -> int:
-        return max(round(FPS * self._clock.length_s / self._speed), 1)
-
     def frames(self) -> Iterator[UInt8[np.ndarray, "1080 1920 3"]]:
         """All of them."""
-        frame = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         for number in range(self._played):
-            frame = self._frame(self._clock.moment(number / FPS * self._speed), number)
-            yield frame
+            yield self._frame(self._clock.moment(number / FPS * self._speed), number)
         frame = self._frame(self._clock.moment(self._clock.length_s), 0)
         yield from [frame] * round(FPS * PAUSE_S)
-        facts = self._facts
-        card = closing_card(frame, self._headline(), self._details(), facts.verdict, is_reached=facts.is_reached)
+        facts, headline = self._facts, f"{length_text(self._far_m[0])} to {length_text(self._far_m[-1])}"
+        card = closing_card(frame, headline, self._details(), facts.verdict, is_reached=facts.is_reached)
         for number in range(round(FPS * CARD_S)):
             share = min((number + 1) / (0.4 * FPS), 1.0)
             yield card if share == 1 else ((1 - share) * frame + share * card).astype(np.uint8)
 
     def _frame(self, moment: Moment, number: int) -> np.ndarray:
-        if moment.look is None and not self._shows_goal and self._trajectory.goal is not None:
+        if moment.look is None and not self._shows_goal:
             self._shows_goal = True
             start = self._trajectory.states[0]
-            moved = self._distances(start.poses) > _MOVED_M
-            self._view.show_goal(start.names, self._trajectory.goal, moved, start.light)
+            self._view.show_goal(start.names, self._goal, self._distances(start) > _MOVED_M, start.light)
         scene, now = self._scene(moment, number)
         if moment.look is not None:
             view, stage = self._view.with_look(scene, moment.look), _LOOKING[moment.look.look]
@@ -499,20 +468,8 @@ class _Film:
             self._drawn = *key, self._view.scene(state), to_uint8(now)
         return self._drawn[2], self._drawn[3]
 
-    def _distances(self, poses: Pose) -> Float[np.ndarray, "N"]:
-        goal = self._trajectory.goal
-        if goal is None:
-            return np.zeros(len(poses.position))
-        return np.linalg.norm((poses.position - goal.position)[:, :2], axis=1)
-
-    def _far_m(self) -> Float[np.ndarray, "A"]:
-        if self._facts.far_m is not None:
-            return self._facts.far_m
-        return np.array([self._distances(state.poses).max(initial=0.0) for state in self._trajectory.states])
-
-    def _headline(self) -> str:
-        far = self._far_m()
-        return f"{length_text(far[0])} to {length_text(far[-1])}"
+    def _distances(self, state: SceneState) -> Float[np.ndarray, "N"]:
+        return np.linalg.norm((state.poses.position - self._goal.position)[:, :2], axis=1)
 
     def _details(self) -> str:
         count = len(self._trajectory.states) - 1

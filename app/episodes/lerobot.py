@@ -28,7 +28,7 @@ from osfcore.contrib.export.lerobot import (
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.states import pose_rows
-from osfcore.io.files import reading_png
+from osfcore.io.files import new_folder, reading_png
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.imaging import RayTracer, TracedMesh
@@ -68,9 +68,7 @@ def write_lerobot(
         raise InvalidInput("kind of observations", repr(obs), f"one of {', '.join(KINDS)}")
     if image_side % 2:
         raise InvalidInput("image size [px]", image_side, "even, as videos need it")
-    out = out.absolute()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InvalidInput("output folder", out, "new or empty")
+    out = new_folder(out)
     read = [read_episode(folder) for folder in folders]
     for episode in read:
         _check(episode, read[0], obs)
@@ -110,13 +108,9 @@ def _episodes(
             goal = pose_rows(course.goal)
             environment = np.array([environment_state(pose_rows(state.poses), goal) for state in course.states[:-1]])
         pusher = np.array([state.pusher[:2] for state in course.states[:-1] if state.pusher is not None])
-        task = instruction(course.names, _moved(episode.report.get("moved")))
+        moved = episode.report.get("moved")
+        task = instruction(course.names, [str(name) for name in moved] if isinstance(moved, list) else ())
         yield LeRobotEpisode(task, _actions(episode), pusher, environment, images)
-
-
-def _moved(told: object) -> tuple[str, ...]:
-    """Objects that a report says had to move; none if it does not know."""
-    return tuple(map(str, told)) if isinstance(told, list) else ()
 
 
 def _actions(episode: FinishedEpisode) -> Float[np.ndarray, "T 2"]:
@@ -138,10 +132,7 @@ def _images(
     states = episode.trajectory.states[:-1]
     views = np.array([[to_uint8(picture.rgb) for picture in tracer.render(state, cameras)] for state in states])
     seen = {image_name(camera.name): views[:, number] for number, camera in enumerate(cameras)}
-    return {**seen, GOAL_IMAGE: np.broadcast_to(_goal(episode.folder / GOAL_FILE, side), (len(states), side, side, 3))}
-
-
-def _goal(path: Path, side: int) -> UInt8[np.ndarray, "side side 3"]:
-    """The goal image, in a square of the others' size."""
+    path = episode.folder / GOAL_FILE
     with reading_png(path, "it is no image"), Image.open(path) as image:
-        return np.asarray(ImageOps.pad(image.convert("RGB"), (side, side)))
+        goal = np.asarray(ImageOps.pad(image.convert("RGB"), (side, side)))
+    return {**seen, GOAL_IMAGE: np.broadcast_to(goal, (len(states), side, side, 3))}

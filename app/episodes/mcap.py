@@ -41,30 +41,7 @@ from osfcore.objects.asset_library import AssetLibrary
 
 need("mcap", "An MCAP file")
 import foxglove  # noqa: E402
-from foxglove import channels  # noqa: E402
-from foxglove.messages import (  # noqa: E402
-    CameraCalibration,
-    Color,
-    CompressedImage,
-    CubePrimitive,
-    CylinderPrimitive,
-    FoxgloveMessage,
-    FrameTransform,
-    FrameTransforms,
-    LinePrimitive,
-    LinePrimitiveLineType,
-    LogLevel,
-    Point3,
-    Quaternion,
-    SceneEntity,
-    SceneUpdate,
-    SpherePrimitive,
-    Timestamp,
-    TriangleListPrimitive,
-    Vector3,
-)
-from foxglove.messages import Log as LogMessage  # noqa: E402
-from foxglove.messages import Pose as PoseMessage  # noqa: E402
+from foxglove import channels, messages  # noqa: E402
 
 Rgba = tuple[float, float, float, float]
 _NANOSECONDS = 1_000_000_000
@@ -76,66 +53,59 @@ def time_ns(action: int) -> int:
     return round(action * STEP_S * _NANOSECONDS)
 
 
-def stamp(action: int) -> Timestamp:
+def stamp(action: int) -> messages.Timestamp:
     """The same as messages have it."""
-    return Timestamp(*divmod(time_ns(action), _NANOSECONDS))
+    return messages.Timestamp(*divmod(time_ns(action), _NANOSECONDS))
 
 
-def transform(child: str, pose: Pose, action: int) -> FrameTransform:
+def transform(child: str, pose: Pose, action: int) -> messages.FrameTransform:
     """`T_world_child`, after some actions."""
     w, x, y, z = pose.quaternion.tolist()
-    return FrameTransform(
+    return messages.FrameTransform(
         timestamp=stamp(action), parent_frame_id="world", child_frame_id=child,
-        translation=vector(*pose.position.tolist()), rotation=Quaternion(x=x, y=y, z=z, w=w),
+        translation=vector(*pose.position.tolist()), rotation=messages.Quaternion(x=x, y=y, z=z, w=w),
     )  # fmt: skip
 
 
-def entity(name: str, frame: str, action: int = 0, **primitives: Any) -> SceneEntity:  # noqa: ANN401  lists of theirs
+def entity(name: str, frame: str, action: int = 0, **primitives: Any) -> messages.SceneEntity:  # noqa: ANN401  lists of theirs
     """Shapes that move with a frame, from after some actions on."""
-    return SceneEntity(id=name, frame_id=frame, frame_locked=True, timestamp=stamp(action), **primitives)
+    return messages.SceneEntity(id=name, frame_id=frame, frame_locked=True, timestamp=stamp(action), **primitives)
 
 
-def triangles(mesh: TexturedMesh, colour: Rgba | None = None) -> TriangleListPrimitive:
+def triangles(mesh: TexturedMesh, colour: Rgba | None = None) -> messages.TriangleListPrimitive:
     """A mesh in its own frame, in one colour or in those that its texture has at the vertices.
 
     Triangles rather than embedded glTF, of which viewers disagree which axis is up.
     """
     points, indices = _points(mesh.vertices), mesh.faces.reshape(-1).tolist()
     if colour is not None:
-        return TriangleListPrimitive(pose=at_origin(), points=points, indices=indices, color=colour_of(colour))
+        return messages.TriangleListPrimitive(pose=at_origin(), points=points, indices=indices, color=colour_of(colour))
     height, width = mesh.texture.shape[:2]
     columns = (mesh.uv[:, 0] * (width - 1)).round().astype(int)
     rows = ((1 - mesh.uv[:, 1]) * (height - 1)).round().astype(int)
     colours = [colour_of((r, g, b, 1.0)) for r, g, b in (mesh.texture[rows, columns] / 255).tolist()]
-    return TriangleListPrimitive(pose=at_origin(), points=points, indices=indices, colors=colours)
+    return messages.TriangleListPrimitive(pose=at_origin(), points=points, indices=indices, colors=colours)
 
 
-def line(positions: Float[np.ndarray, "P 3"], colour: Rgba) -> LinePrimitive:
-    """A polyline."""
-    return LinePrimitive(
-        type=LinePrimitiveLineType.LineStrip, pose=at_origin(), thickness=_LINE_PX, scale_invariant=True,
-        points=_points(positions), color=colour_of(colour),
-    )  # fmt: skip
-
-
-def at_origin(height_m: float = 0.0) -> PoseMessage:
+def at_origin(height_m: float = 0.0) -> messages.Pose:
     """A pose at the frame's origin, or above it."""
-    return PoseMessage(position=vector(0.0, 0.0, height_m), orientation=Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+    unturned = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+    return messages.Pose(position=vector(0.0, 0.0, height_m), orientation=unturned)
 
 
-def vector(x: float, y: float, z: float) -> Vector3:
+def vector(x: float, y: float, z: float) -> messages.Vector3:
     """A vector, or sizes along the axes."""
-    return Vector3(x=x, y=y, z=z)
+    return messages.Vector3(x=x, y=y, z=z)
 
 
-def colour_of(rgba: Rgba) -> Color:
+def colour_of(rgba: Rgba) -> messages.Color:
     """A colour."""
     r, g, b, a = rgba
-    return Color(r=r, g=g, b=b, a=a)
+    return messages.Color(r=r, g=g, b=b, a=a)
 
 
-def _points(positions: Float[np.ndarray, "P 3"]) -> list[Point3]:
-    return [Point3(x=x, y=y, z=z) for x, y, z in positions.tolist()]
+def _points(positions: Float[np.ndarray, "P 3"]) -> list[messages.Point3]:
+    return [messages.Point3(x=x, y=y, z=z) for x, y, z in positions.tolist()]
 
 
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -155,7 +125,7 @@ class Log:
         self._context = context
         self._channels: dict[str, Any] = {}
 
-    def put(self, topic: str, message: FoxgloveMessage, action: int) -> None:
+    def put(self, topic: str, message: messages.FoxgloveMessage, action: int) -> None:
         """Write a message at the time after some actions."""
         if topic not in self._channels:
             kind = getattr(channels, f"{type(message).__name__}Channel")
@@ -169,40 +139,42 @@ def log_transforms(log: Log, trajectory: Trajectory) -> None:
     fixed = [transform("goal_camera", goal_camera().T_world_camera, 0)]
     if trajectory.goal is not None:
         fixed += [transform(f"goal/{name}", trajectory.goal[n], 0) for n, name in enumerate(names)]
-    log.put("/tf", FrameTransforms(transforms=fixed), 0)
+    log.put("/tf", messages.FrameTransforms(transforms=fixed), 0)
     for action, state in enumerate(trajectory.states):
         here = [transform(name, state.poses[n], action) for n, name in enumerate(names)]
         here.append(transform("light", Pose(state.light.position, _NO_TURN), action))
         if state.pusher is not None:
             here.append(transform("pusher", Pose(state.pusher, _NO_TURN), action))
-        log.put("/tf", FrameTransforms(transforms=here), action)
+        log.put("/tf", messages.FrameTransforms(transforms=here), action)
     for round_ in trajectory.rounds:
         poses, action = round_.estimate.state.poses, round_.action
         thought = [transform(f"estimate/{name}", poses[n], action) for n, name in enumerate(names)]
-        log.put("/tf", FrameTransforms(transforms=thought), action)
+        log.put("/tf", messages.FrameTransforms(transforms=thought), action)
 
 
 def log_scene(log: Log, trajectory: Trajectory, meshes: Mapping[str, TexturedMesh]) -> None:
     """What everything looks like; frames tell where it is."""
-    table = CubePrimitive(
+    table = messages.CubePrimitive(
         pose=at_origin(-_TABLE_M / 2), size=vector(TABLE_SIDE_M, TABLE_SIDE_M, _TABLE_M), color=colour_of(_WOOD)
     )
-    hand = CylinderPrimitive(
+    hand = messages.CylinderPrimitive(
         pose=at_origin(), size=vector(2 * PUSHER_RADIUS_M, 2 * PUSHER_RADIUS_M, PUSHER_HEIGHT_M),
         bottom_scale=1.0, top_scale=1.0, color=colour_of((*PUSHER_ALBEDO, 1.0)),
     )  # fmt: skip
-    lamp = SpherePrimitive(pose=at_origin(), size=vector(_LAMP_M, _LAMP_M, _LAMP_M), color=colour_of(_LAMP))
+    lamp = messages.SpherePrimitive(pose=at_origin(), size=vector(_LAMP_M, _LAMP_M, _LAMP_M), color=colour_of(_LAMP))
     things = [
         entity("table", "world", cubes=[table]),
         entity("pusher", "pusher", cylinders=[hand]),
         entity("light", "light", spheres=[lamp]),
         *(entity(name, name, triangles=[triangles(mesh)]) for name, mesh in meshes.items()),
     ]
-    log.put("/scene", SceneUpdate(entities=things), 0)
+    log.put("/scene", messages.SceneUpdate(entities=things), 0)
     ghosts = {"estimate": _THOUGHT} if trajectory.rounds else {}
-    for which, colour in (ghosts if trajectory.goal is None else {**ghosts, "goal": _WANTED}).items():
+    if trajectory.goal is not None:
+        ghosts["goal"] = _WANTED
+    for which, colour in ghosts.items():
         copies = [entity(n, f"{which}/{n}", triangles=[triangles(mesh, colour)]) for n, mesh in meshes.items()]
-        log.put(f"/{which}", SceneUpdate(entities=copies), 0)
+        log.put(f"/{which}", messages.SceneUpdate(entities=copies), 0)
 
 
 def log_plans(log: Log, rounds: Sequence[Round]) -> None:
@@ -210,8 +182,11 @@ def log_plans(log: Log, rounds: Sequence[Round]) -> None:
     before = 0
     for round_ in rounds:
         if round_.plan is not None:
-            way = line(round_.plan.best.pusher[0], _PLANNED)
-            log.put("/plan", SceneUpdate(entities=[entity("plan", "world", before, lines=[way])]), before)
+            way = messages.LinePrimitive(
+                type=messages.LinePrimitiveLineType.LineStrip, pose=at_origin(), color=colour_of(_PLANNED),
+                points=_points(round_.plan.best.pusher[0]), thickness=_LINE_PX, scale_invariant=True,
+            )  # fmt: skip
+            log.put("/plan", messages.SceneUpdate(entities=[entity("plan", "world", before, lines=[way])]), before)
         before = round_.action
 
 
@@ -223,7 +198,7 @@ def log_images(log: Log, folder: Path, rounds: Sequence[Round]) -> None:
             camera = goal_camera().resized(*image.size)
         flat = camera.intrinsics.reshape(-1).tolist()
         projection = np.pad(camera.intrinsics, ((0, 0), (0, 1))).reshape(-1).tolist()
-        calibration = CameraCalibration(
+        calibration = messages.CameraCalibration(
             timestamp=stamp(0), frame_id="goal_camera", width=camera.width, height=camera.height,
             K=flat, P=projection, R=np.eye(3).reshape(-1).tolist(),
         )  # fmt: skip
@@ -233,16 +208,16 @@ def log_images(log: Log, folder: Path, rounds: Sequence[Round]) -> None:
         log.put("/frames", _image(path, "", round_.action), round_.action)
 
 
-def _image(path: Path, frame: str, action: int) -> CompressedImage:
-    return CompressedImage(timestamp=stamp(action), frame_id=frame, data=path.read_bytes(), format="png")
+def _image(path: Path, frame: str, action: int) -> messages.CompressedImage:
+    return messages.CompressedImage(timestamp=stamp(action), frame_id=frame, data=path.read_bytes(), format="png")
 
 
 def log_words(log: Log, report: Mapping[str, Any]) -> None:
     """What was noticed, and how it ended."""
-    noticed = [(LogLevel.Warning, one["text"], one["step"]) for one in report.get("noticed", ())]
+    noticed = [(messages.LogLevel.Warning, one["text"], one["step"]) for one in report.get("noticed", ())]
     end = report.get("text") or "It was ended early."
-    for level, text, action in [*noticed, (LogLevel.Info, end, report.get("steps_done", 0))]:
-        log.put("/log", LogMessage(timestamp=stamp(action), level=level, message=text, name="osf"), action)
+    for level, text, action in [*noticed, (messages.LogLevel.Info, end, report.get("steps_done", 0))]:
+        log.put("/log", messages.Log(timestamp=stamp(action), level=level, message=text, name="osf"), action)
 
 
 def write_mcap(folder: Path, library: AssetLibrary, path: Path) -> float:

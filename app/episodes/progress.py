@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 from osfcore.control.events import ActionExecuted, Event, Finished, GoalFound, Looking, Noticed, Planning, Stepped
@@ -39,49 +39,30 @@ class EpisodeProgress:
 
     def after(self, event: Event) -> Self:
         """Return how far the episode is once something has happened."""
-        then = replace(self, note=_note_of(event) or self.note, stage=_stage_of(event) or self.stage)
         match event:
-            case ActionExecuted(number):
-                return replace(then, done=number)
+            case Looking():
+                return replace(self, note=_note_of(event), stage=event.look)
+            case GoalFound():
+                return replace(self, note="Knows where everything should be")
+            case Planning():
+                return replace(self, note="Planning pushes", stage="plan")
             case Stepped():
-                return replace(then, total=event.steps)
+                return replace(self, note="Planning pushes", stage="plan", total=event.steps)
+            case ActionExecuted(number):
+                return replace(self, note="Pushing", stage="act", done=number)
+            case Noticed():
+                return replace(self, note=event.text)
             case Finished(_, outcome, text):
-                return replace(then, outcome=outcome, text=text, note=text)
+                return replace(self, note=text, outcome=outcome, text=text)
             case _:
-                return then
+                return self
 
 
-def _note_of(event: Event) -> str | None:
-    """What is being done, for a person; None if this event changes nothing about it."""
-    match event:
-        case Looking():
-            if event.step.estimate is not None:
-                return _FOUND[event.look]
-            where = {"first": "first frame", "goal": "goal image", "next": "table", "search": "lost objects"}
-            return f"Looking at the {where[event.look]}: {event.step.progress.note}"
-        case GoalFound():
-            return "Knows where everything should be"
-        case Stepped() | Planning():
-            return "Planning pushes"
-        case ActionExecuted():
-            return "Pushing"
-        case Noticed():
-            return event.text
-        case _:
-            return None
-
-
-def _stage_of(event: Event) -> str | None:
-    """Which part of the loop an event belongs to; None if it says nothing about that."""
-    match event:
-        case Looking():
-            return event.look
-        case Stepped() | Planning():
-            return "plan"
-        case ActionExecuted():
-            return "act"
-        case _:
-            return None
+def _note_of(event: Looking) -> str:
+    if event.step.estimate is not None:
+        return _FOUND[event.look]
+    where = {"first": "first frame", "goal": "goal image", "next": "table", "search": "lost objects"}
+    return f"Looking at the {where[event.look]}: {event.step.progress.note}"
 
 
 # How far an episode is and how long it will take, over all of looking, planning and pushing.
@@ -94,7 +75,6 @@ _PUSHES = 20
 _FEW = 3  # pushes that tell nothing of how many it takes
 
 
-@dataclass(slots=True)
 class TimeLeft:
     """The share of an episode that is over, from its events.
 
@@ -102,32 +82,23 @@ class TimeLeft:
     the sum of the offsets from the goal is gone at the mean rate so far, or to the last push where offsets are not
     known. A rest that ends with `go_on` does not count.
 
-    Attributes:
+    Args:
         clock: tells the time [s].
         finds_goal: whether the goal image is looked at for poses.
     """
 
-    clock: Callable[[], float] = time.monotonic
-    finds_goal: bool = True
-    _now: float = field(init=False)
-    _elapsed: float = field(init=False, default=0.0)  # [s], of the whole episode
-    _since: dict[str, float] = field(init=False, default_factory=dict)  # when each part began, on `_elapsed`
-    _left: dict[str, float] = field(init=False, default_factory=lambda: dict(_LOOK_S))
-    _first_off_m: float = field(init=False, default=0.0)
-    _off_m: float = field(init=False, default=0.0)
-    _is_blind: bool = field(init=False, default=False)  # offsets are not known
-    _pushes: int = field(init=False, default=0)
-    _share: float = field(init=False, default=0.0)
-
-    def __post_init__(self) -> None:
-        """Begin."""
-        self._now = self.clock()
-        if not self.finds_goal:
-            del self._left["goal"]
+    def __init__(self, clock: Callable[[], float] = time.monotonic, finds_goal: bool = True) -> None:
+        self._clock, self._now = clock, clock()
+        self._elapsed = 0.0  # [s], of the whole episode
+        self._since: dict[str, float] = {}  # when each part began, on `_elapsed`
+        self._left = {look: seconds for look, seconds in _LOOK_S.items() if finds_goal or look != "goal"}
+        self._first_off_m = self._off_m = 0.0
+        self._is_blind = False  # offsets are not known
+        self._pushes, self._share = 0, 0.0
 
     def go_on(self) -> None:
         """A rest is over."""
-        self._now = self.clock()
+        self._now = self._clock()
 
     def take(self, event: Event, most: int) -> tuple[float, float]:
         """What an event tells.
@@ -139,7 +110,7 @@ class TimeLeft:
         Returns:
             Share of the episode that is over, which never falls, and time left [s].
         """
-        now = self.clock()
+        now = self._clock()
         self._elapsed += now - self._now
         self._now = now
         match event:

@@ -138,8 +138,7 @@ class EpisodeRecord:
         self._clock, self._since = clock, clock()
         self._actions: list[list[float]] = []
         self._end: tuple[str, str] | None = None
-        self._start = None if table is None else table.truth()
-        self._course = None if self._start is None else TrajectoryRecorder(self._start)
+        self._course = None if table is None else TrajectoryRecorder(table.truth())
         for left in (folder / FRAMES_FOLDER).glob("[0-9]*.png"):  # of an earlier, perhaps longer episode
             left.unlink()
         if about.image is not None:
@@ -249,7 +248,8 @@ class EpisodeRecord:
             "truth": state_to_json(truth),
         }
         if self._about.goal is not None:
-            entry["truly_to_goal_mm"] = by_name(names, 1000 * _shift(truth, self._about.goal))
+            there = self._about.goal.reordered(truth.names).poses.position
+            entry["truly_to_goal_mm"] = by_name(names, 1000 * np.linalg.norm(truth.poses.position - there, axis=1))
         return entry
 
     def _draw(self, event: Stepped) -> None:
@@ -296,7 +296,7 @@ class EpisodeRecord:
             "objects": list(about.names),
             "method": about.method,
             "settings": asdict(about.settings),
-            "goal": None if self._goal is None else goal_to_json(self._goal),
+            "goal": None if self._goal is None else _goal_entry(self._goal),
             "noticed": self._notices,
             "actions": self._actions,
             "steps": self._steps,
@@ -307,10 +307,10 @@ class EpisodeRecord:
             report["parts"] = about.parts.to_json()
         if about.goal is not None:
             report["moved"] = list(about.moved)
-        if about.goal is not None and about.moved and self._table is not None and self._start is not None:
-            task = RearrangementTask(0, self._start, about.goal, about.moved)
-            score = score_of(task, self._table.truth(), about.symmetries)
-            report["score"], report["success_2cm"] = score.to_json(), score.is_success()
+            if about.moved and self._table is not None and self._course is not None:
+                task = RearrangementTask(0, self._course.states[0], about.goal, about.moved)
+                score = score_of(task, self._table.truth(), about.symmetries)
+                report["score"], report["success_2cm"] = score.to_json(), score.is_success()
         return report
 
 
@@ -327,13 +327,8 @@ def by_name(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
     return {name: round(float(value), 3) for name, value in zip(names, values, strict=True)}
 
 
-def _shift(state: SceneState, goal: SceneState) -> Float[np.ndarray, "N"]:
-    there = np.array([goal.pose(name).position for name in state.names])
-    return np.linalg.norm(state.poses.position - there, axis=1)
-
-
-def goal_to_json(goal: GoalFound) -> dict[str, Any]:
-    """A goal as reports have it."""
+def _goal_entry(goal: GoalFound) -> dict[str, Any]:
+    """A goal as the report has it."""
     objects = [encode(ObjectJson.of(name, goal.goal.poses[n])) for n, name in enumerate(goal.goal.names)]
     estimate = None if goal.estimate is None else estimated_to_json(goal.estimate)
     return {"objects": objects, "estimate": estimate}

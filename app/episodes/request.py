@@ -124,7 +124,7 @@ def given(order: EpisodeOrder) -> Given:
         OsfError: if the objects, the image or the numbers are not as they must be.
     """
     assets, fields = AssetLibrary(order.data_dir / "objects"), FieldLibrary(order.data_dir)
-    layout = None if order.found is None else _layout(order, read_json(order.found, _found))
+    layout = None if order.found is None else _layout(order, order.found)
     names = order.names if layout is None else tuple(layout.poses)
     for name in names or ():
         fields.info(name)
@@ -149,11 +149,8 @@ def _given_by_image(order: EpisodeOrder, world: SimulatedWorld) -> Given:
     return Given(world, read_goal(order.goal, goal_camera()), None, ())
 
 
-def _found(data: object) -> FoundScene:
-    return decode(FoundScene, data, "found objects")
-
-
-def _layout(order: EpisodeOrder, found: FoundScene) -> TableLayout:
+def _layout(order: EpisodeOrder, path: Path) -> TableLayout:
+    found = read_json(path, lambda data: decode(FoundScene, data, "found objects"))
     for what, given in (("goal image", order.goal), ("names of objects", order.names)):
         if given is not None:
             allowed = "left out with what was found in a photo, which tells goal and objects"

@@ -14,7 +14,6 @@ from osfcore.paper.method import Method
 from osfcore.paper.mppi import STEPS, GaussianPlanSettings
 from osfcore.planning.mppi import PlanSettings
 
-_PLAN = ("samples", "horizon", "temperature")
 _FIXED = {  # of the method as published: what it is called, and what it cannot but be
     "cost": ("cost", "image"),
     "replan_every": ("actions of each plan", 1),
@@ -57,17 +56,9 @@ class ChosenSettings:
         loop = EpisodeSettings() if method == "ours" else EpisodeSettings(STEPS, cost="image")
         plan = loop.plan if method == "ours" else GaussianPlanSettings()
         return cls(
-            method,
-            loop.steps,
-            loop.replan_every,
-            loop.cost,
-            plan.samples,
-            plan.horizon,
-            plan.temperature,
-            loop.planning,
-            loop.acting,
-            loop.despite_doubts,
-        )
+            method, loop.steps, loop.replan_every, loop.cost, plan.samples, plan.horizon, plan.temperature,
+            loop.planning, loop.acting, loop.despite_doubts,
+        )  # fmt: skip
 
     @classmethod
     def of_stored(cls, stored: Mapping[str, Any]) -> ChosenSettings:
@@ -101,7 +92,7 @@ class ChosenSettings:
         Raises:
             InvalidInput: if a number is out of range.
         """
-        plan = PlanSettings(**{name: getattr(self, name) for name in _PLAN})
+        plan = PlanSettings(samples=self.samples, horizon=self.horizon, temperature=self.temperature)
         return EpisodeSettings(
             self.steps, self.replan_every, self.cost, plan, self.planning, self.acting, self.despite_doubts
         )

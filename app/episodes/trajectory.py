@@ -131,8 +131,9 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    states, looks, rounds = trajectory.states, trajectory.looks, trajectory.rounds
+    states, looks, rounds, count = trajectory.states, trajectory.looks, trajectory.rounds, len(trajectory.names)
     plans = [round_.plan for round_ in rounds if round_.plan is not None]
+    best = [Pose(plan.best.positions[0], plan.best.quaternions[0]) for plan in plans]
     arrays = {
         "names": np.array(trajectory.names),
         **_states("states", states),
@@ -140,22 +141,20 @@ def _arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
         "looks/progress": np.array([(look.done, look.loss) for look in looks], np.float32).reshape(-1, 2),
         **_states("looks", [look.state for look in looks]),
         "looks/tried": np.array([len(look.candidates.position) for look in looks], np.int32),
-        "looks/candidates": _poses([look.candidates for look in looks], len(trajectory.names)),
+        "looks/candidates": _stacked([_rows(look.candidates) for look in looks], count, 7),
         "rounds/action": np.array([round_.action for round_ in rounds], np.int32),
         **_states("rounds", [round_.estimate.state for round_ in rounds]),
         "rounds/doubted": np.array([[bool(doubt) for doubt in round_.estimate.doubts] for round_ in rounds]),
         "rounds/has_plan": np.array([round_.plan is not None for round_ in rounds], bool),
         "plans/horizon": np.array([len(plan.best.pusher[0]) for plan in plans], np.int32),
         "plans/ways": _stacked([plan.ways.reshape(-1, 2) for plan in plans], 2),
-        "plans/costs": np.concatenate([plan.costs for plan in plans] or [np.zeros(0)]).astype(np.float32),
+        "plans/costs": _stacked([plan.costs for plan in plans]),
         "plans/count": np.array([len(plan.costs) for plan in plans], np.int32),
-        "plans/best": _poses(
-            [Pose(plan.best.positions[0], plan.best.quaternions[0]) for plan in plans], len(trajectory.names)
-        ),
+        "plans/best": _stacked([_rows(pose) for pose in best], count, 7),
         "plans/pusher": _stacked([plan.best.pusher[0] for plan in plans], 3),
     }
     if trajectory.goal is not None:
-        arrays["goal"] = np.concatenate([trajectory.goal.position, trajectory.goal.quaternion], axis=1)
+        arrays["goal"] = _rows(trajectory.goal)
     return {name: _small(name, array) for name, array in arrays.items()}
 
 
@@ -167,7 +166,7 @@ def _trajectory(arrays: Mapping[str, np.ndarray]) -> Trajectory:
     goal = arrays.get("goal")
     return Trajectory(
         tuple(states),
-        None if goal is None else Pose(goal[:, :3].astype(float), goal[:, 3:].astype(float)),
+        None if goal is None else _pose(goal),
         tuple(_read_looks(names, arrays)),
         tuple(_read_rounds(names, arrays)),
     )
@@ -175,10 +174,9 @@ def _trajectory(arrays: Mapping[str, np.ndarray]) -> Trajectory:
 
 def _states(prefix: str, states: Sequence[SceneState]) -> dict[str, np.ndarray]:
     count = len(states[0].names) if states else 0
-    poses = [np.concatenate([state.poses.position, state.poses.quaternion], axis=1) for state in states]
     nowhere = np.full(3, np.nan)
     return {
-        f"{prefix}/poses": np.array(poses).reshape(len(states), count, 7),
+        f"{prefix}/poses": np.array([_rows(state.poses) for state in states]).reshape(len(states), count, 7),
         f"{prefix}/light": np.array([state.light.position for state in states]).reshape(-1, 3),
         f"{prefix}/pusher": np.array([nowhere if s.pusher is None else s.pusher for s in states]).reshape(-1, 3),
     }
@@ -188,10 +186,7 @@ def _read_states(names: tuple[str, ...], prefix: str, arrays: Mapping[str, np.nd
     rows = zip(arrays[f"{prefix}/poses"], arrays[f"{prefix}/light"], arrays[f"{prefix}/pusher"], strict=True)
     return [
         SceneState(
-            names,
-            Pose(poses[:, :3].astype(float), poses[:, 3:].astype(float)),
-            Light(light.astype(float)),
-            None if np.isnan(pusher).any() else pusher.astype(float),
+            names, _pose(poses), Light(light.astype(float)), None if np.isnan(pusher).any() else pusher.astype(float)
         )
         for poses, light, pusher in rows
     ]
@@ -202,7 +197,7 @@ def _read_looks(names: tuple[str, ...], arrays: Mapping[str, np.ndarray]) -> lis
     states = _read_states(names, "looks", arrays)
     rows = zip(arrays["looks/which"], arrays["looks/progress"], states, tried, strict=True)
     return [
-        LookFrame(LOOKS[which], float(done), float(loss), state, Pose(poses[..., :3], poses[..., 3:]))
+        LookFrame(LOOKS[which], float(done), float(loss), state, _pose(poses))
         for which, (done, loss), state, poses in rows
     ]
 
@@ -237,13 +232,17 @@ def _read_plans(names: tuple[str, ...], arrays: Mapping[str, np.ndarray]) -> lis
     ]
 
 
-def _poses(batches: Sequence[Pose], count: int) -> Float[np.ndarray, "R N 7"]:
-    return _stacked([np.concatenate([p.position, p.quaternion], axis=-1).reshape(-1, count * 7) for p in batches],
-                    count * 7).reshape(-1, count, 7)  # fmt: skip
+def _rows(poses: Pose) -> Float[np.ndarray, "*batch 7"]:
+    return np.concatenate([poses.position, poses.quaternion], axis=-1)
 
 
-def _stacked(parts: Sequence[np.ndarray], width: int) -> Float[np.ndarray, "R width"]:
-    return np.concatenate([*parts, np.zeros((0, width))]).astype(np.float32)
+def _pose(rows: Float[np.ndarray, "*batch 7"]) -> Pose:
+    return Pose(rows[..., :3].astype(float), rows[..., 3:].astype(float))
+
+
+def _stacked(parts: Sequence[np.ndarray], *shape: int) -> Float[np.ndarray, "R *shape"]:
+    """Join parts of any length; without any, the array has length 0."""
+    return np.concatenate([*parts, np.zeros((0, *shape))]).astype(np.float32)
 
 
 def _split(rows: np.ndarray, lengths: Int[np.ndarray, "P"]) -> list[np.ndarray]:
@@ -282,8 +281,6 @@ class TrajectoryRecorder:
     Attributes:
         states: true ones, at the beginning and after each action.
     """
-
-    states: list[SceneState]
 
     def __init__(self, start: SceneState) -> None:
         self.states = [start]
@@ -341,8 +338,7 @@ class _Thinned:
 
 def _frame(look: LookAt, step: EstimateStep) -> LookFrame:
     progress = step.progress
-    count = len(step.state.names)
-    candidates = Pose(np.zeros((0, count, 3)), np.zeros((0, count, 4)))
+    candidates = Pose.identity(0, len(step.state.names))
     if step.candidates is not None:
         tried = len(step.candidates.position)
         candidates = step.candidates[np.unique(np.linspace(0, tried - 1, min(CANDIDATES, tried)).astype(int))]
@@ -387,9 +383,6 @@ class ReplayClock:
         looks_s: how long the looks take [s].
         step_s: when each round is over, from the beginning of the replay [s]; the first one right after the looks.
     """
-
-    looks_s: float
-    step_s: tuple[float, ...]
 
     def __init__(self, trajectory: Trajectory) -> None:
         self._trajectory = trajectory

@@ -19,7 +19,7 @@ from typing import Literal
 from app.storage.database import FILE, SCHEMA_VERSION, CannotStore, check_database, copy_database, now_utc
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, shown
 from osfcore.io.archives import ArchiveKind, unpack
-from osfcore.io.files import file_at_once, folder_at_once, read_json
+from osfcore.io.files import file_at_once, folder_at_once, read_json, writing
 from osfcore.io.json_codec import Entry, Text, decode
 from osfcore.io.output_paths import check_place
 
@@ -68,12 +68,11 @@ def back_up(data_dir: Path, out: Path) -> Manifest:
         raise CorruptFile(data_dir, "there is no such data directory, or nothing is stored there")
     database = out.with_name(f".{out.name}.{os.getpid()}.sqlite3")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+        with writing(out):
+            out.parent.mkdir(parents=True, exist_ok=True)
         # Not packed: images, weights and meshes hardly shrink.
         with file_at_once(out) as partial, zipfile.ZipFile(partial, "w") as archive:
             return _fill(archive, data_dir, database)
-    except OSError as error:
-        raise CannotWrite(out, error.strerror or str(error)) from error
     except sqlite3.DatabaseError as error:
         raise CannotWrite(out, str(error)) from error
     finally:
@@ -101,21 +100,13 @@ def restore(archive: Path, data_dir: Path) -> Manifest:
     with folder_at_once(data_dir) as folder:
         unpack(archive, folder, _BACKUP, _MAX_BYTES, _MAX_FILES)
         manifest = _checked(archive, folder)
-        try:
+        with writing(data_dir):
             (folder / MANIFEST).unlink()
-        except OSError as error:
-            raise CannotWrite(data_dir, error.strerror or str(error)) from error
     return manifest
 
 
 def _fill(archive: zipfile.ZipFile, data_dir: Path, database: Path) -> Manifest:
-    """Write everything to an archive.
-
-    Args:
-        archive: to write.
-        data_dir: of the service.
-        database: a temporary file.
-    """
+    """Write everything to an archive, the database by way of a temporary file."""
     sizes = []
     # The database comes first: what it tells of was complete by then. A job that comes later merely adds files.
     if (data_dir / FILE).exists():

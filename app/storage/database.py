@@ -28,11 +28,11 @@ from typing import IO, Annotated, Any
 from pydantic import Field, FiniteFloat
 
 from app.processes.messages.scene_messages import SceneRecord
-from osfcore.errors import CorruptFile, InvalidInput, OsfError, shown
+from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, shown
 from osfcore.geometry.cameras import image_side
 from osfcore.io.files import put_in_place, sync
-from osfcore.io.json_codec import Entry, Text, decode, encode
-from osfcore.io.scene_file import StateJson
+from osfcore.io.json_codec import Entry, Text, decode
+from osfcore.io.scene_file import StateJson, state_to_json
 
 FILE = "service.sqlite3"
 _APPLICATION_ID = 0x4F534631  # "OSF1"
@@ -112,14 +112,27 @@ class UnusableDatabase(CorruptFile):
         self.label, self.reason = label, reason
 
 
+@contextlib.contextmanager
+def storing(path: Path) -> Iterator[None]:
+    """Raise what the disk refuses as `CannotStore` of a path."""
+    try:
+        yield
+    except CannotWrite as error:
+        raise CannotStore(path, error.reason) from error
+    except OSError as error:
+        raise CannotStore(path, error.strerror or str(error)) from error
+    except sqlite3.DatabaseError as error:
+        raise CannotStore(path, str(error)) from error
+
+
 def now_utc() -> str:
     """The time in UTC, ISO 8601 with milliseconds."""
     return utc_of(datetime.now(UTC).timestamp())
 
 
-def utc_of(seconds: float) -> str:
-    """A moment since the epoch [s] in the same form."""
-    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+def utc_of(seconds: float, timespec: str = "milliseconds") -> str:
+    """A moment since the epoch [s] in the same form, or as exactly as `datetime.isoformat` is asked."""
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec=timespec).replace("+00:00", "Z")
 
 
 # The open database
@@ -159,7 +172,7 @@ class Store:
         try:
             self._database = self._open()
             self._files = identities(self._path, self._path.with_name(f"{FILE}-wal"))
-            self._left_as, self._checked_at = _stamp(self._path), time.monotonic()
+            self._left_as, self._checked_at = stamp(self._path), time.monotonic()
         except BaseException:
             self._lock_file.close()
             raise
@@ -246,7 +259,7 @@ class Store:
             with contextlib.suppress(sqlite3.DatabaseError):  # some failures have ended the transaction already
                 self._database.execute("ROLLBACK")
             raise CannotStore(Path(FILE), str(error)) from error
-        self._left_as = _stamp(self._path)
+        self._left_as = stamp(self._path)
         return number
 
     def _check_file(self) -> None:
@@ -263,22 +276,19 @@ class Store:
             reason = "it, its log or the data directory was moved, deleted or replaced while the service runs"
         elif self._path.stat().st_size == 0:  # SQLite would delete the log if it were opened
             reason = "it was emptied while the service runs"
-        elif _stamp(self._path) != self._left_as or time.monotonic() - self._checked_at > _CHECK_S:
+        elif stamp(self._path) != self._left_as or time.monotonic() - self._checked_at > _CHECK_S:
             try:
                 check_database(self._path)
             except CorruptFile:
                 reason = "it was damaged while the service runs"
             else:
-                self._left_as, self._checked_at = _stamp(self._path), time.monotonic()
+                self._left_as, self._checked_at = stamp(self._path), time.monotonic()
         if reason is not None:
             raise CannotStore(Path(FILE), reason, PUT_BACK)
 
     def _read(self, sql: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        with self._lock:
-            try:
-                return self._database.execute(sql, values).fetchall()
-            except sqlite3.DatabaseError as error:
-                raise CannotStore(Path(FILE), str(error)) from error
+        with self._lock, storing(Path(FILE)):
+            return self._database.execute(sql, values).fetchall()
 
     # Scenes
 
@@ -415,22 +425,20 @@ def identities(*paths: Path) -> dict[Path, tuple[int, int] | None]:
     return found
 
 
-def _stamp(path: Path) -> tuple[int, int] | None:
-    """Return what changes whenever a file is written; None if there is none."""
+def stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return what changes whenever a file or folder does; None if there is none."""
     try:
         state = path.stat()
     except OSError:
         return None
-    return state.st_size, state.st_mtime_ns
+    return state.st_ino, state.st_size, state.st_mtime_ns
 
 
 def _claim(data_dir: Path) -> IO[str]:
     """The lock file of a data directory, held until it is closed."""
-    try:
+    with storing(data_dir):
         data_dir.mkdir(parents=True, exist_ok=True)
         file = (data_dir / "service.lock").open("w")
-    except OSError as error:
-        raise CannotStore(data_dir, error.strerror or str(error)) from error
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
@@ -440,7 +448,9 @@ def _claim(data_dir: Path) -> IO[str]:
 
 
 def _note(entry: SetAside) -> Statement:
-    return "INSERT INTO set_aside (kind, id, row, reason, at) VALUES (?, ?, ?, ?, ?)", _set_aside_row(entry)
+    """What stores an entry; halves of characters, which no database takes, are spelled out."""
+    values = tuple(text.encode("utf-8", "backslashreplace").decode() for text in astuple(entry))
+    return "INSERT INTO set_aside (kind, id, row, reason, at) VALUES (?, ?, ?, ?, ?)", values
 
 
 # Rows: what is written for scenes and jobs, and what is checked when it is read again
@@ -467,16 +477,10 @@ class SetAside:
     @property
     def sentence(self) -> str:
         """What happened, for people."""
-        if self.kind == "database" and not self.id:
-            return f"{FILE} cannot be used: {self.reason}; scenes and jobs are gone, and an empty one took its place."
         if self.kind == "database":
-            return f"{FILE} cannot be used: {self.reason}; it is named {self.id} now, and an empty one took its place."
+            then = f"it is named {self.id} now" if self.id else "scenes and jobs are gone"
+            return f"{FILE} cannot be used: {self.reason}; {then}, and an empty one took its place."
         return f"The stored {self.kind} {shown(self.id)} makes no sense and was set aside: {self.reason}."
-
-
-def _set_aside_row(entry: SetAside) -> tuple[str, ...]:
-    """Its values; halves of characters, which no database takes, are spelled out."""
-    return tuple(text.encode("utf-8", "backslashreplace").decode() for text in astuple(entry))
 
 
 class _Scene(Entry):
@@ -492,8 +496,8 @@ class _Scene(Entry):
 
 def _scene_row(record: SceneRecord) -> tuple[Any, ...]:
     """The values of a scene in the order of the columns."""
-    states = {name: json.dumps(encode(StateJson.of(getattr(record, name)))) for name in ("initial", "state")}
-    return tuple(states.get(name, getattr(record, name)) for name in _SCENE_COLUMNS)
+    initial, state = (json.dumps(state_to_json(each)) for each in (record.initial, record.state))
+    return record.id, record.seed, record.created_at, record.image_size, initial, state, record.time_s, record.revision
 
 
 def _scene_of_row(row: Mapping[str, Any]) -> SceneRecord:
@@ -507,8 +511,8 @@ def _scene_of_row(row: Mapping[str, Any]) -> SceneRecord:
     initial, state = entry.initial.state(), entry.state.state()
     if initial.names != state.names:
         raise InvalidInput("list of objects", ", ".join(state.names), f"as it began: {', '.join(initial.names)}")
-    facts = {name: getattr(entry, name) for name in ("id", "seed", "created_at", "time_s", "revision")}
-    return SceneRecord(**facts, image_size=image_side(entry.image_size), initial=initial, state=state)
+    size = image_side(entry.image_size)
+    return SceneRecord(entry.id, entry.seed, entry.created_at, size, initial, state, entry.time_s, entry.revision)
 
 
 def _job_of_row(text: str, job: str | None = None) -> dict[str, Any]:
@@ -541,24 +545,26 @@ def check_database(path: Path) -> int:
         CorruptFile: if it is another program's.
         CannotStore: if it cannot be opened.
     """
-    if _stamp(path) is not None and path.stat().st_size == 0:  # opened, it would be a new one, and its log deleted
+    if stamp(path) is not None and path.stat().st_size == 0:  # opened, it would be a new one, and its log deleted
         raise UnusableDatabase(path, "empty", "it is empty")
-    with _connected(path) as database:
-        version = database.execute("PRAGMA user_version").fetchone()[0]
-        owner = database.execute("PRAGMA application_id").fetchone()[0]
-        if database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
-            return 0
-        if owner != _APPLICATION_ID:
-            raise CorruptFile(path, "it is another program's database; move it away")
-        if version > SCHEMA_VERSION:
-            raise UnusableDatabase(
-                path,
-                f"newer-{version}",
-                f"a newer version wrote it (format {version}, this one knows {SCHEMA_VERSION})",
-            )
-        if version < 1 or not _is_sound(database):
-            raise UnusableDatabase(path, "damaged", "it is damaged")
-    return version
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as database:
+            version = database.execute("PRAGMA user_version").fetchone()[0]
+            owner = database.execute("PRAGMA application_id").fetchone()[0]
+            if database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
+                return 0
+            if owner != _APPLICATION_ID:
+                raise CorruptFile(path, "it is another program's database; move it away")
+            if version > SCHEMA_VERSION:
+                formats = f"format {version}, this one knows {SCHEMA_VERSION}"
+                raise UnusableDatabase(path, f"newer-{version}", f"a newer version wrote it ({formats})")
+            if version < 1 or not _is_sound(database):
+                raise UnusableDatabase(path, "damaged", "it is damaged")
+            return version
+    except sqlite3.OperationalError as error:
+        raise CannotStore(path, str(error)) from error
+    except sqlite3.DatabaseError as error:
+        raise UnusableDatabase(path, "damaged", "it is damaged") from error
 
 
 def open_database(path: Path) -> sqlite3.Connection:
@@ -570,14 +576,14 @@ def open_database(path: Path) -> sqlite3.Connection:
         CannotStore: if it cannot be written.
     """
     version = check_database(path)
-    try:
+    with storing(path):
         if 0 < version < SCHEMA_VERSION:
-            _keep_copy(path, unused(path.with_name(f"{path.name}.format-{version}")))
+            older = unused(path.with_name(f"{path.name}.format-{version}"))
+            partial_copy = older.with_name(f".{older.name}.part")
+            partial_copy.unlink(missing_ok=True)
+            copy_database(path, partial_copy)
+            put_in_place(partial_copy, older)
         return _migrated(path, version)
-    except sqlite3.DatabaseError as error:
-        raise CannotStore(path, str(error)) from error
-    except OSError as error:
-        raise CannotStore(path, error.strerror or str(error)) from error
 
 
 def put_aside(path: Path, label: str) -> Path:
@@ -587,14 +593,12 @@ def put_aside(path: Path, label: str) -> Path:
         CannotStore: if that is not allowed.
     """
     place = unused(path.with_name(f"{path.name}.{label}"))
-    try:
+    with storing(path):
         for suffix in ("-wal", "-shm", ""):  # beside a new file, the older one's log would be taken for its own
             part = path.with_name(path.name + suffix)
             if part.exists():
                 part.rename(place.with_name(place.name + suffix))
         sync(path.parent)
-    except OSError as error:
-        raise CannotStore(path, error.strerror or str(error)) from error
     return place
 
 
@@ -620,18 +624,6 @@ def unused(path: Path) -> Path:
     return free
 
 
-@contextlib.contextmanager
-def _connected(path: Path) -> Iterator[sqlite3.Connection]:
-    """A connection for a look, after which every failure is one of ours."""
-    try:
-        with contextlib.closing(sqlite3.connect(path)) as database:
-            yield database
-    except sqlite3.OperationalError as error:
-        raise CannotStore(path, str(error)) from error
-    except sqlite3.DatabaseError as error:
-        raise UnusableDatabase(path, "damaged", "it is damaged") from error
-
-
 def _is_sound(database: sqlite3.Connection) -> bool:
     if database.execute("PRAGMA quick_check").fetchone()[0] != "ok":
         return False
@@ -641,13 +633,6 @@ def _is_sound(database: sqlite3.Connection) -> bool:
     except sqlite3.OperationalError:  # no such table, or column
         return False
     return True
-
-
-def _keep_copy(path: Path, place: Path) -> None:
-    partial_copy = place.with_name(f".{place.name}.part")
-    partial_copy.unlink(missing_ok=True)
-    copy_database(path, partial_copy)
-    put_in_place(partial_copy, place)
 
 
 def _migrated(path: Path, version: int) -> sqlite3.Connection:

@@ -12,10 +12,10 @@ import json
 import shutil
 import tempfile
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from app.storage.database import utc_of
 from app.storage.usage import folder_bytes
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
 from osfcore.io.files import remove_folder, scratch_folder, sync, sync_tree, write_atomically, writing
@@ -72,8 +72,8 @@ def workshops(data_dir: Path) -> tuple[Leftover, ...]:
     for place in sorted((data_dir / "training").glob("[!.]*")):
         with contextlib.suppress(OSError):  # one that is being removed must not hide the others
             if place.is_dir():
-                changed = datetime.fromtimestamp(place.stat().st_mtime, UTC).isoformat(timespec="seconds")
-                found.append(Leftover(place.name, folder_bytes(place), changed.replace("+00:00", "Z")))
+                changed_at = utc_of(place.stat().st_mtime, "seconds")
+                found.append(Leftover(place.name, folder_bytes(place), changed_at))
     return tuple(found)
 
 

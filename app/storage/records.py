@@ -11,7 +11,7 @@ import json
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -24,9 +24,9 @@ from pydantic import ConfigDict, Field, GetPydanticSchema
 from pydantic_core import core_schema
 
 from app.processes.messages.photo_messages import CameraSource, Mark, Points
-from app.storage.database import CannotStore
+from app.storage.database import stamp, storing
 from app.storage.photos import PhotoCrop
-from osfcore.errors import CannotWrite, CorruptFile, NotThere, OsfError, UnknownName, shown
+from osfcore.errors import CorruptFile, NotThere, OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, unit_quaternion
 from osfcore.io.files import folder_at_once, is_file_name, put_in_place, read_json, reading_png, remove_folder
@@ -135,7 +135,7 @@ class RecordFolders(Generic[Record]):
             UnknownName: if there is none.
             CannotStore: if that is not allowed.
         """
-        with self._lock, self._stored():
+        with self._lock, storing(Path(self._root.name)):
             remove_folder(self._folder(name))
 
     def check_room(self) -> None:
@@ -151,7 +151,7 @@ class RecordFolders(Generic[Record]):
             files: of it, by name.
             made: a folder beside its place with more files, which becomes the record's; None for none.
         """
-        with self._lock, self._stored():  # others may come in at the same time
+        with self._lock, storing(Path(self._root.name)):  # others may come in at the same time
             self.check_room()
             latest = max((each.number for each in self._found() if not isinstance(each, Damaged)), default=0)
             record = replace(record, number=latest + 1)
@@ -165,7 +165,7 @@ class RecordFolders(Generic[Record]):
 
     def _replace(self, record: Record, files: Files) -> None:
         """Give a record that exists other files and facts, the facts last; files that are None are removed."""
-        with self._lock, self._stored():
+        with self._lock, storing(Path(self._root.name)):
             place = self._folder(record.id)
             with tempfile.TemporaryDirectory(prefix=".", dir=self._root) as folder:
                 self._write(Path(folder), record, files)  # all of it before anything changes
@@ -206,7 +206,7 @@ class RecordFolders(Generic[Record]):
             UnknownName: if it is not there any more.
         """
         facts, picture = folder / self._facts, folder / self._picture
-        stamps = tuple(_stamp(path) for path in (folder, facts, picture))
+        stamps = tuple(stamp(path) for path in (folder, facts, picture))
         before, record = self._known.get(folder, (None, None))
         if record is not None and before == stamps:
             return record
@@ -221,25 +221,6 @@ class RecordFolders(Generic[Record]):
             record = Damaged(folder.name, f"{Path(error.path).name}: {error.reason}")
         self._known[folder] = stamps, record
         return record
-
-    @contextlib.contextmanager
-    def _stored(self) -> Iterator[None]:
-        """Raise what the disk refuses as an error for people."""
-        try:
-            yield
-        except CannotWrite as error:
-            raise CannotStore(Path(self._root.name), error.reason) from error
-        except OSError as error:
-            raise CannotStore(Path(self._root.name), error.strerror or str(error)) from error
-
-
-def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return what changes when a file or folder does; None if there is none."""
-    try:
-        state = path.stat()
-    except OSError:
-        return None
-    return state.st_ino, state.st_size, state.st_mtime_ns
 
 
 def _check_picture(path: Path) -> None:

@@ -17,7 +17,7 @@ from starlette.concurrency import run_in_threadpool
 from app.processes.child_process import limit_memory, own_group
 from app.processes.client import ProcessClient, ProcessHangs, ProcessUnavailable
 from app.processes.server import ProcessServer
-from app.storage.database import CannotStore
+from app.storage.database import storing
 from osfcore.errors import CannotWrite, CorruptFile, OsfError
 from osfcore.io.archives import check_zip
 
@@ -41,7 +41,7 @@ async def save(chunks: AsyncIterator[bytes], file: Path) -> None:
     Raises:
         CannotStore: if the disk is full.
     """
-    try:
+    with storing(Path(file.parent.parent.name)):
         await run_in_threadpool(file.parent.mkdir, parents=True)
         with file.open("wb") as sink:
             waiting = bytearray()
@@ -51,8 +51,6 @@ async def save(chunks: AsyncIterator[bytes], file: Path) -> None:
                     await run_in_threadpool(sink.write, bytes(waiting))
                     waiting.clear()
             await run_in_threadpool(sink.write, bytes(waiting))
-    except OSError as error:
-        raise CannotStore(Path(file.parent.parent.name), error.strerror or str(error)) from error
 
 
 class Examiner(Generic[Found]):
@@ -97,15 +95,12 @@ class Examiner(Generic[Found]):
             UploadNotStored: if the disk is full.
         """
         if self._archive is not None:  # what is no zip at all need not wait for a process
-            await run_in_threadpool(self._check, folder / self._archive)
+            try:
+                await run_in_threadpool(check_zip, folder / self._archive)
+            except CorruptFile as error:
+                raise UploadRefused(self._plain(str(error), folder)) from error
         async with self._one_at_a_time:
             return await run_in_threadpool(self._examine, folder)
-
-    def _check(self, archive: Path) -> None:
-        try:
-            check_zip(archive)
-        except CorruptFile as error:
-            raise UploadRefused(self._plain(str(error), archive.parent)) from error
 
     def _examine(self, folder: Path) -> Found:
         with self._lock:
