@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from app.cli.command import DataCommand, follow, show_table
+from app.cli.command import DataCommand, choice_of, follow, show_table
 from app.cli.workers import worker_pool
 from osfcore.errors import OsfError
 
@@ -46,7 +46,7 @@ class AssetsList(DataCommand):
 class AssetsFetch(DataCommand):
     """Fetch objects of the catalogue and make them ready: texture, collision parts, resting orientations."""
 
-    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Objects such as 006_mustard_bottle; none: all that the source offers."""
     source: str = "pypi"
     """"pypi" (ten objects), a folder with NAME/google_16k/textured.obj, or the http(s) address of such a folder or of
@@ -75,7 +75,7 @@ class AssetsFetch(DataCommand):
 class AssetsAdd(DataCommand):
     """Add an object of your own from a textured mesh."""
 
-    mesh: Annotated[Path, tyro.conf.Positional]
+    mesh: tyro.conf.Positional[Path]
     """OBJ, GLB or PLY file, in metres."""
     name: str
     """What scenes call it: lower-case letters, digits, '_' and '-'."""
@@ -103,12 +103,7 @@ class AssetsAdd(DataCommand):
         return row
 
 
-Assets = Annotated[
-    Annotated[AssetsList, tyro.conf.subcommand("list")]
-    | Annotated[AssetsFetch, tyro.conf.subcommand("fetch")]
-    | Annotated[AssetsAdd, tyro.conf.subcommand("add")],
-    tyro.conf.OmitSubcommandPrefixes,
-]
+Assets = choice_of(list=AssetsList, fetch=AssetsFetch, add=AssetsAdd)
 
 
 def _compile() -> None:

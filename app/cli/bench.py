@@ -5,11 +5,11 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
-import tyro
-
-from app.cli.command import DataCommand, report_of
+from app.cli.command import DataCommand, choice_of, report_of
+from osfcore.io.files import write_json
+from osfcore.io.output_paths import check_place
 
 _PICTURE = "render.png"
 
@@ -24,9 +24,6 @@ class _Benchmark(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds figures and tables."""
-        from osfcore.io.files import write_json
-        from osfcore.io.output_paths import check_place
-
         if self.out is not None:  # before the work begins
             for name in (self.FIGURES, _PICTURE):
                 check_place(self.out / name)
@@ -173,20 +170,13 @@ class BenchPlannerCommand(_Benchmark):
             interval = row["coverage_interval"]
             spread = "" if interval is None else " ({:.2f} to {:.2f})".format(*interval)
             coverage = f"{row['coverage_mean']:.2f}{spread}"
-            times = "".join(
-                f"{row[f'plan_s_{key}']:>{width}.2f}" for key, width in (("mean", 10), ("p90", 6), ("most", 6))
-            )
             print(
                 f"{name:14}{success:>22}{coverage:>22}{row['coverage_median']:>8.2f}{row['coverage_least']:>8.2f}"
-                f"{row['plan_hz']:>13.1f} Hz{times}"
-                f"{row['own_hz']:>15.0f} Hz"
+                f"{row['plan_hz']:>13.1f} Hz{row['plan_s_mean']:>10.2f}{row['plan_s_p90']:>6.2f}"
+                f"{row['plan_s_most']:>6.2f}{row['own_hz']:>15.0f} Hz"
             )
 
 
-Bench = Annotated[
-    Annotated[BenchRenderCommand, tyro.conf.subcommand("render")]
-    | Annotated[BenchEstimateCommand, tyro.conf.subcommand("estimate")]
-    | Annotated[BenchDynamicsCommand, tyro.conf.subcommand("dynamics")]
-    | Annotated[BenchPlannerCommand, tyro.conf.subcommand("planner")],
-    tyro.conf.OmitSubcommandPrefixes,
-]
+Bench = choice_of(
+    render=BenchRenderCommand, estimate=BenchEstimateCommand, dynamics=BenchDynamicsCommand, planner=BenchPlannerCommand
+)

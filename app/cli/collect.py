@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand, follow, options_as
+from app.cli.command import Command, DataCommand, choice_of, last_of, options_as
 from app.cli.workers import worker_pool
 
 _IN_FLIGHT = 64  # episodes that a cluster is given at once
@@ -33,8 +33,8 @@ class CollectObjectCommand(DataCommand):
         """Collect; the result names the folder and the counts."""
         from osfcore.world.collect_images import CollectObject, collect_object
 
-        last = follow(collect_object(options_as(CollectObject, self), self.assets))
-        return {"out": str(self.out), "images": last.total if last else 0}
+        last = last_of(collect_object(options_as(CollectObject, self), self.assets))
+        return {"out": str(self.out), "images": last.total}
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class CollectTableCommand(Command):
         """Collect; the result names the folder and the counts."""
         from osfcore.world.collect_images import CollectTable, collect_table
 
-        last = follow(collect_table(options_as(CollectTable, self)))
-        return {"out": str(self.out), "images": last.total if last else 0}
+        last = last_of(collect_table(options_as(CollectTable, self)))
+        return {"out": str(self.out), "images": last.total}
 
 
 @dataclass(frozen=True)
@@ -97,18 +97,14 @@ class CollectPushesCommand(DataCommand):
         """Collect; the result has the shares of steps with contact and motion, and the rate."""
         from osfcore.world.collect_pushes import CollectPushes, collect_pushes
 
-        settings = options_as(CollectPushes, self)
         in_flight = self.workers + 2 if self.cluster is None else _IN_FLIGHT
         with worker_pool(self.workers, self.cluster) as executor:
-            last = follow(collect_pushes(settings, self.assets, executor, in_flight))
-        result: dict[str, Any] = {"out": str(settings.out), "episodes": settings.episodes, "steps": settings.steps}
-        if last is not None:
-            result |= {
-                "contact_share": round(last.contact_share, 4),
-                "motion_share": round(last.motion_share, 4),
-                "episodes_per_s": round(last.episodes_per_s, 2),
-            }
-        return result
+            last = last_of(collect_pushes(options_as(CollectPushes, self), self.assets, executor, in_flight))
+        shares = {"contact_share": round(last.contact_share, 4), "motion_share": round(last.motion_share, 4)}
+        rate = round(last.episodes_per_s, 2)
+        return {
+            "out": str(self.out), "episodes": self.episodes, "steps": self.steps, **shares, "episodes_per_s": rate,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -132,17 +128,15 @@ class CollectObservationCommand(DataCommand):
         """Collect; the result names the folder and what is to be seen."""
         from osfcore.world.collect_images import CollectObservation, collect_observation
 
-        settings = options_as(CollectObservation, self)
-        made = collect_observation(settings, self.assets, self.trained.names())
+        made = collect_observation(options_as(CollectObservation, self), self.assets, self.trained.names())
         views = "1 view" if len(made.cameras) == 1 else f"{len(made.cameras)} views"
         self.say(f"Wrote {self.out}: {views} of {', '.join(made.names)}.")
         return {"out": str(self.out), "objects": list(made.names), "cameras": [c.name for c in made.cameras]}
 
 
-Collect = Annotated[
-    Annotated[CollectObjectCommand, tyro.conf.subcommand("object")]
-    | Annotated[CollectTableCommand, tyro.conf.subcommand("table")]
-    | Annotated[CollectPushesCommand, tyro.conf.subcommand("pushes")]
-    | Annotated[CollectObservationCommand, tyro.conf.subcommand("observation")],
-    tyro.conf.OmitSubcommandPrefixes,
-]
+Collect = choice_of(
+    object=CollectObjectCommand,
+    table=CollectTableCommand,
+    pushes=CollectPushesCommand,
+    observation=CollectObservationCommand,
+)

@@ -7,12 +7,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar, Union
 
 import tyro
 
 from app.storage.paths import default_data_dir
 from osfcore.errors import InvalidInput
+from osfcore.io.output_paths import check_place
 
 if TYPE_CHECKING:
     from osfcore.fields.field_library import FieldLibrary
@@ -22,7 +23,7 @@ T = TypeVar("T")
 Device = Annotated[
     Literal["auto", "cpu", "cuda"], tyro.conf.arg(help="What computes; auto takes a GPU where there is one.")
 ]
-Flat = Annotated[T, tyro.conf.arg(name="")]  # settings of the core whose fields are options of the command itself
+Seed = Annotated[int, tyro.conf.arg(help="Of everything random.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +41,16 @@ class Command(ABC):
         """Print sentences for people, at once, a line each; with `--json` nothing."""
         if not self.json:
             print(*sentences, sep="\n", flush=True)
+
+
+def choice_of(**kinds: type[Command]) -> Any:  # noqa: ANN401  a type that is made while the program runs
+    """Return what tyro reads as a choice between commands.
+
+    Args:
+        kinds: the command of each name.
+    """
+    choices = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items()]
+    return Annotated[Union[tuple(choices)], tyro.conf.OmitSubcommandPrefixes]  # noqa: UP007
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +82,6 @@ def check_out(out: Path, *suffixes: str) -> str:
         InvalidInput: if it has none of them.
         CannotWrite: if nothing can be written there.
     """
-    from osfcore.io.output_paths import check_place
-
     suffix = out.suffix.lower()
     if suffix not in suffixes:
         raise InvalidInput("output file", out, f"a path that ends in {' or '.join(suffixes)}")
@@ -80,35 +89,25 @@ def check_out(out: Path, *suffixes: str) -> str:
     return suffix
 
 
-class Step(Protocol):
+class _Step(Protocol):
     """How far a piece of work is; `osfcore.progress.Progress` and richer steps fit."""
 
     @property
-    def done(self) -> int:
-        """Units finished."""
-        ...
-
+    def done(self) -> int: ...
     @property
-    def total(self) -> int:
-        """Units in all."""
-        ...
-
+    def total(self) -> int: ...
     @property
-    def note(self) -> str:
-        """What is being done."""
-        ...
+    def note(self) -> str: ...
 
 
-class StepWithProgress(Protocol):
+class _StepWithProgress(Protocol):
     """A step of a kind that keeps its progress in a field."""
 
     @property
-    def progress(self) -> Step:
-        """How far the work is."""
-        ...
+    def progress(self) -> _Step: ...
 
 
-StepT = TypeVar("StepT", bound=Step | StepWithProgress)
+StepT = TypeVar("StepT", bound=_Step | _StepWithProgress)
 
 
 def follow(steps: Iterable[StepT]) -> StepT | None:
@@ -120,15 +119,21 @@ def follow(steps: Iterable[StepT]) -> StepT | None:
     return _follow_with_bar(steps) if sys.stderr.isatty() else _follow_with_lines(steps)
 
 
-def report_of(steps: Iterable[Any]) -> Any:  # noqa: ANN401  each kind of work has reports of its own
-    """Run through the steps with a progress bar; return the report that the last one brings."""
+def last_of(steps: Iterable[StepT]) -> StepT:
+    """Run through the steps of work that has at least one, and show them; return the last."""
     last = follow(steps)
     assert last is not None
+    return last
+
+
+def report_of(steps: Iterable[Any]) -> Any:  # noqa: ANN401  each kind of work has reports of its own
+    """Run through the steps with a progress bar; return the report that the last one brings."""
+    last = last_of(steps)
     assert last.report is not None, "the last step brings the report"
     return last.report
 
 
-def _progress(step: Step | StepWithProgress) -> Step:
+def _progress(step: _Step | _StepWithProgress) -> _Step:
     progress: Any = getattr(step, "progress", step)
     return progress
 
@@ -179,10 +184,17 @@ def show_table(rows: Iterable[Iterable[str]], titles: Iterable[str], left: Itera
     Console().print(table)
 
 
-def options_as(kind: type[T], command: object) -> T:
+def options_as(kind: type[T], command: object, **others: object) -> T:
     """Return settings of the core from the options of a command that have the names of their fields.
 
-    Commands whose settings stand in a module that loads torch or a simulator state the options once more: taken from
-    there, they would load it for every help page.
+    An option that is None leaves the settings' own default. Commands whose settings stand in a module that loads torch
+    or a simulator state the options once more: taken from there, they would load it for every help page.
+
+    Args:
+        kind: of the settings.
+        command: has the options.
+        others: values of fields that are not taken from an option.
     """
-    return kind(**{field.name: getattr(command, field.name) for field in fields(kind)})  # pyright: ignore[reportArgumentType]
+    names = [field.name for field in fields(kind) if field.name not in others]  # pyright: ignore[reportArgumentType]
+    given = {name: getattr(command, name) for name in names if getattr(command, name) is not None}
+    return kind(**given, **others)

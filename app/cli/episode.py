@@ -10,7 +10,9 @@ from typing import Any, Literal
 
 import tyro
 
-from app.cli.command import DataCommand, Device, follow, report_of
+from app.cli.command import DataCommand, Device, last_of, report_of
+from osfcore.errors import check_seed
+from osfcore.io.output_paths import check_place
 
 
 @dataclass(frozen=True)
@@ -63,9 +65,7 @@ class RunEpisode(DataCommand):
         from app.episodes.record import PartNames
         from app.episodes.request import EpisodeOrder, run_episode
         from osfcore.control.events import CostKind, EpisodeSettings
-        from osfcore.errors import check_seed
         from osfcore.fields.devices import pick_device
-        from osfcore.io.output_paths import check_place
         from osfcore.planning.mppi import PlanSettings
 
         plan = PlanSettings(self.samples, self.horizon, self.temperature)
@@ -109,8 +109,7 @@ class Clip(DataCommand):
         from app.episodes.clip import FPS, clip_of
 
         with ThreadPoolExecutor(2) as executor:
-            last = follow(clip_of(self.episode, self.assets, self.out, executor))
-        assert last is not None, "a clip has frames"
+            last = last_of(clip_of(self.episode, self.assets, self.out, executor))
         seconds = round(last.total / FPS, 1)
         self.say(f"{self.out}: {seconds:g} s")
         return {"out": str(self.out), "seconds": seconds}
@@ -156,7 +155,6 @@ class Mcap(DataCommand):
     def run(self) -> dict[str, Any]:
         """Write it."""
         from app.episodes.mcap import write_mcap
-        from osfcore.io.output_paths import check_place
 
         check_place(self.out)
         seconds = write_mcap(self.episode, self.assets, self.out)

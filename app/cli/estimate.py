@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from app.cli.command import DataCommand, Device, check_out, follow
-from osfcore.errors import InvalidInput
+from app.cli.command import DataCommand, Device, check_out, follow, last_of
+from osfcore.errors import InvalidInput, check_seed, shown
+from osfcore.io.output_paths import check_place
+from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
     import numpy as np
 
     from osfcore.estimation.objective import ObjectModels
+    from osfcore.fields.field_library import FieldLibrary
     from osfcore.geometry.cameras import Camera
     from osfcore.geometry.rollouts import Rollouts
     from osfcore.geometry.states import EstimatedState, Observation, SceneState
+    from osfcore.render.renderer import SceneRenderer
 
 
 @dataclass(frozen=True)
@@ -43,13 +47,15 @@ class Estimate(DataCommand):
     def run(self) -> dict[str, Any]:
         """Estimate; the result is what state.json holds, and how long it took."""
         from app.jobs.kinds.estimates import load_models, steps_of
-        from osfcore.errors import check_seed
-        from osfcore.io.observation_file import read_observation
+        from osfcore.io.observation_file import OBSERVATION_FILE, read_observation
         from osfcore.io.scene_file import estimated_to_json, read_estimated, write_estimated
-        from osfcore.random_streams import Stream, stream_rng
 
         rng = stream_rng(check_seed(self.seed), Stream.FIRST_FRAME)
-        self._check_places()
+        check_out(self.out, ".json")
+        if self.out.resolve() == (self.observation / OBSERVATION_FILE).resolve():
+            raise InvalidInput("output file", self.out, "another file than the observation")
+        if self.images is not None:
+            check_place(_sheet_path(self.images, 0))
         if self.goal and self.prior is None:
             raise InvalidInput("--prior", "missing", "given: how the objects lie now")
         observation = read_observation(self.observation)
@@ -57,9 +63,7 @@ class Estimate(DataCommand):
         models = load_models(self.data_dir, observation.names, self.method)
         start = time.perf_counter()
         mode = "goal" if self.goal else "first" if prior is None else "next"
-        last = follow(steps_of(mode, models, observation, prior, rng, self.method))
-        assert last is not None
-        estimate = last.estimate
+        estimate = last_of(steps_of(mode, models, observation, prior, rng, self.method)).estimate
         assert estimate is not None, "the last step brings the estimate"
         seconds = round(time.perf_counter() - start, 2)
         write_estimated(self.out, estimate)
@@ -69,23 +73,10 @@ class Estimate(DataCommand):
             self.say(f"{self.images} shows observed and rendered images of {len(observation.cameras)} cameras.")
         return {**estimated_to_json(estimate), "seconds": seconds}
 
-    def _check_places(self) -> None:
-        """Refuse what cannot be written, or would overwrite what is read, before the work begins."""
-        from osfcore.io.observation_file import OBSERVATION_FILE
-        from osfcore.io.output_paths import check_place
-
-        check_out(self.out, ".json")
-        if self.out.resolve() == (self.observation / OBSERVATION_FILE).resolve():
-            raise InvalidInput("output file", self.out, "another file than the observation")
-        if self.images is not None:
-            check_place(_sheet_path(self.images, 0))
-
 
 def _summary(estimate: EstimatedState) -> list[str]:
     """The estimate for people: a line for each object, one for the light, one for the trust."""
     import numpy as np
-
-    from osfcore.errors import shown
 
     names = [shown(name, 40) for name in estimate.state.names]
     width = max(len(name) for name in (*names, "object"))
@@ -106,7 +97,6 @@ def _summary(estimate: EstimatedState) -> list[str]:
 
 def _write_sheets(folder: Path, models: ObjectModels, observation: Observation, estimate: EstimatedState) -> None:
     """One sheet for each camera: what was observed, what the estimate looks like, and the difference."""
-    from osfcore.errors import shown
     from osfcore.inspection.contact_sheet import Comparison, contact_sheet
     from osfcore.io.image_file import to_uint8, write_png
     from osfcore.metrics.image_errors import psnr
@@ -149,9 +139,12 @@ class Predict(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Predict; the result has how far each object goes at most [mm], and PSNR by step where it is known."""
+        import numpy as np
+
         from osfcore.dynamics.rollout import load_push_model
         from osfcore.fields.devices import pick_device
-        from osfcore.io.scene_file import read_actions, read_estimated, write_rollouts
+        from osfcore.geometry.cameras import default_cameras, goal_camera
+        from osfcore.io.scene_file import read_actions, read_estimated, read_scene, write_rollouts
         from osfcore.paper.dynamics import load_paper_push_model
 
         check_out(self.out, ".json")
@@ -159,38 +152,25 @@ class Predict(DataCommand):
         before = None if self.before is None else read_estimated(self.before).state
         if self.images is not None and not 0 <= self.sequence < len(actions):
             raise InvalidInput("sequence", self.sequence, f"between 0 and {len(actions) - 1}")
-        camera = self._camera() if self.images is not None else None
+        camera = None
+        if self.images is not None:
+            camera = _camera(self.camera, (*default_cameras(), goal_camera(), *read_scene(self.state).cameras))
         load = load_paper_push_model if self.method == "paper" else load_push_model
         model = load(self.data_dir, self.trained, state.names, pick_device(self.device))
         start = time.perf_counter()
         rollouts = model.rollout(state, actions, before)
         seconds = time.perf_counter() - start
         write_rollouts(self.out, rollouts)
-        result = self._result(rollouts, seconds)
+        way = np.linalg.norm(rollouts.positions - rollouts.positions[:, :1], axis=-1).max(axis=(0, 1))
+        count, times = rollouts.positions.shape[:2]
+        result: dict[str, Any] = {
+            "out": str(self.out), "sequences": count, "steps": times - 1, "seconds": round(seconds, 4),
+            "farthest_mm": {name: round(1e3 * float(m), 3) for name, m in zip(rollouts.names, way, strict=True)},
+        }  # fmt: skip
         if self.images is not None and camera is not None:
             result |= self._pictures(self.images, state, actions, rollouts, camera)
         self.say(*_prediction_text(result))
         return result
-
-    def _result(self, rollouts: Rollouts, seconds: float) -> dict[str, Any]:
-        import numpy as np
-
-        way = np.linalg.norm(rollouts.positions - rollouts.positions[:, :1], axis=-1).max(axis=(0, 1))
-        count, times = rollouts.positions.shape[:2]
-        moved = {name: round(1e3 * float(mm), 3) for name, mm in zip(rollouts.names, way, strict=True)}
-        return {"out": str(self.out), "sequences": count, "steps": times - 1, "seconds": round(seconds, 4),
-                "farthest_mm": moved}  # fmt: skip
-
-    def _camera(self) -> Camera:
-        from osfcore.geometry.cameras import default_cameras, goal_camera
-        from osfcore.io.files import read_json
-        from osfcore.io.scene_file import scene_from_json
-
-        own = read_json(self.state, scene_from_json).cameras
-        known = {camera.name: camera for camera in (*default_cameras(), goal_camera(), *own)}
-        if self.camera not in known:
-            raise InvalidInput("camera", self.camera, f"one of {', '.join(known)}")
-        return known[self.camera]
 
     def _pictures(
         self, folder: Path, state: SceneState, actions: np.ndarray, rollouts: Rollouts, camera: Camera
@@ -198,12 +178,9 @@ class Predict(DataCommand):
         """Draw one sequence; PSNR by step where the simulator could be asked."""
         from osfcore.experiments.visual_prediction import PSNR_FILE, VisualPrediction, show_prediction
         from osfcore.extras import missing
-        from osfcore.fields.devices import pick_device
-        from osfcore.render.renderer import SceneRenderer
 
-        library, assets = self.trained, self.assets
-        fields = {name: library.load(name) for name in state.names}
-        renderer = SceneRenderer(fields, library.load_table(), device=str(pick_device(self.device)))
+        assets = self.assets
+        renderer = _renderer(self.trained, state.names, self.device)
         lacking = missing("sim") or [name for name in state.names if not assets.has(name)]
         request = VisualPrediction(state, rollouts, actions, self.sequence, camera, folder)
         follow(show_prediction(request, renderer, None if lacking else assets))
@@ -238,24 +215,33 @@ class Render(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Render with two by two rays a pixel; the result has the file and its size."""
-        from osfcore.fields.devices import pick_device
         from osfcore.geometry.cameras import default_cameras, goal_camera
         from osfcore.io.image_file import to_uint8, write_png
         from osfcore.io.scene_file import read_scene
-        from osfcore.render.renderer import SceneRenderer
         from osfcore.render.types import Quality, SceneBatch
 
         check_out(self.out, ".png")
         scene = read_scene(self.scene)
-        cameras = {camera.name: camera for camera in scene.cameras or (*default_cameras(), goal_camera())}
-        if self.camera not in cameras:
-            raise InvalidInput("camera", self.camera, f"one of {', '.join(cameras)}")
-        fields = {name: self.trained.load(name) for name in scene.state.names}
-        renderer = SceneRenderer(fields, self.trained.load_table(), device=str(pick_device(self.device)))
-        quality = Quality(samples_per_side=2)
-        image = renderer.render(SceneBatch.of(scene.state), (cameras[self.camera],), quality=quality).rgb[0, 0]
-        pixels = to_uint8(image)
+        camera = _camera(self.camera, scene.cameras or (*default_cameras(), goal_camera()))
+        renderer, quality = _renderer(self.trained, scene.state.names, self.device), Quality(samples_per_side=2)
+        pixels = to_uint8(renderer.render(SceneBatch.of(scene.state), (camera,), quality=quality).rgb[0, 0])
         write_png(self.out, pixels)
         height, width = pixels.shape[:2]
         self.say(f"Wrote {self.out}, {width} x {height} px.")
         return {"out": str(self.out), "width": width, "height": height, "objects": list(scene.state.names)}
+
+
+def _camera(name: str, cameras: Iterable[Camera]) -> Camera:
+    known = {camera.name: camera for camera in cameras}
+    if name not in known:
+        raise InvalidInput("camera", name, f"one of {', '.join(known)}")
+    return known[name]
+
+
+def _renderer(library: FieldLibrary, names: Iterable[str], device: str) -> SceneRenderer:
+    """A renderer of these objects and the table."""
+    from osfcore.fields.devices import pick_device
+    from osfcore.render.renderer import SceneRenderer
+
+    fields = {name: library.load(name) for name in names}
+    return SceneRenderer(fields, library.load_table(), device=str(pick_device(device)))

@@ -9,15 +9,13 @@ import sys
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
-
-from app.cli.command import DataCommand, report_of, show_table
+from app.cli.command import DataCommand, Seed, choice_of, report_of, show_table
 from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput
 from osfcore.extras import need
@@ -36,13 +34,12 @@ class Evaluation(DataCommand):
     """Objects; by default all that have a field and a mesh."""
     tasks: int = 20
     """Scenes against the simulator, each with its own objects and light."""
-    seed: int = 0
-    """Of everything random."""
+    seed: Seed = 0
 
     @property
     def folder(self) -> Path:
         """Where results are kept."""
-        return self.data_dir / "evaluation" if self.out is None else self.out
+        return self.out or self.data_dir / "evaluation"
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what the evaluation's report does."""
@@ -55,7 +52,7 @@ class Evaluation(DataCommand):
         return report
 
     def _pool(self) -> AbstractContextManager[Executor | None]:
-        return nullcontext()
+        return worker_pool(1)
 
     @abstractmethod
     def _steps(self, executor: Executor | None) -> Iterator[Any]:
@@ -110,9 +107,8 @@ class EvaluateFieldsCommand(Evaluation):
         rows.append(("mean (size: most)", *means, f"{report['max_file_mb']:.2f}", ""))
         show_table(rows, ("object", "full dB", "mask dB", "SSIM", "MB", "minutes"), left=("object",))
         if report["scenes"]:
-            means = {"whole": "mean", "objects": "object_mean", "shadow": "shadow_mean"}
-            known = {what: report[f"scene_psnr_{which}"] for what, which in means.items()}
-            parts = [f"{what} {psnr:.2f} dB" for what, psnr in known.items() if psnr is not None]
+            keys = {"whole": "scene_psnr_mean", "objects": "scene_psnr_object_mean", "shadow": "scene_psnr_shadow_mean"}
+            parts = [f"{what} {report[key]:.2f} dB" for what, key in keys.items() if report[key] is not None]
             print(f"{report['scenes']} scenes: {', '.join(parts)}")
 
 
@@ -381,8 +377,7 @@ class EvaluatePhotosCommand(DataCommand):
     """Outline, shading and texture; the outline alone, as in the paper."""
     out: Path | None = None
     """Folder for report.json and contact sheets; DATA_DIR/photos by default."""
-    seed: int = 0
-    """Of everything random."""
+    seed: Seed = 0
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what report.json does."""
@@ -390,15 +385,14 @@ class EvaluatePhotosCommand(DataCommand):
         from osfcore.experiments.photos import EvaluatePhotos, evaluate_photos
 
         if self.lamps == "simulated":
-            folder = self.data_dir / "lamps" if self.out is None else self.out
+            folder = self.out or self.data_dir / "lamps"
             config = EvaluateLamps(folder, self.tasks, self.views, self.seed)
             report = report_of(evaluate_lamps(config, self.assets, self.trained))
             self.say(*_lamps_of(report), f"Figures: {folder}")
             return report
         if self.data is None:
-            allowed = "a folder of photographs, or --lamps simulated, which needs none"
-            raise InvalidInput("data", "missing", allowed)
-        folder = self.data_dir / "photos" if self.out is None else self.out
+            raise InvalidInput("data", "missing", "a folder of photographs, or --lamps simulated, which needs none")
+        folder = self.out or self.data_dir / "photos"
         config = EvaluatePhotos(folder, self.data, self.start, self.plane, self.mask_error, self.repeats, self.loss,
                                 self.seed, self.masks)  # fmt: skip
         report = report_of(evaluate_photos(config, self.trained))
@@ -427,8 +421,7 @@ class ReproduceCommand(DataCommand):
     """In a scene; 1 with --quick, else 2, 3 and 4 for the methods and 3 for everything else."""
     actions: int | None = None
     """That an episode may have; 12 with --quick, else 30."""
-    seed: int = 0
-    """Of everything random."""
+    seed: Seed = 0
     names: tuple[str, ...] | None = None
     """Objects; by default all of which every method has a field."""
     workers: int = 2
@@ -464,16 +457,15 @@ class ReproduceCommand(DataCommand):
         return scale
 
 
-Evaluate = Annotated[
-    Annotated[EvaluateFieldsCommand, tyro.conf.subcommand("fields")]
-    | Annotated[EvaluateEstimateCommand, tyro.conf.subcommand("estimate")]
-    | Annotated[EvaluateDynamicsCommand, tyro.conf.subcommand("dynamics")]
-    | Annotated[EvaluateMpcCommand, tyro.conf.subcommand("mpc")]
-    | Annotated[EvaluateRelightingCommand, tyro.conf.subcommand("relighting")]
-    | Annotated[EvaluateVideoCommand, tyro.conf.subcommand("video")]
-    | Annotated[EvaluatePhotosCommand, tyro.conf.subcommand("photos")],
-    tyro.conf.OmitSubcommandPrefixes,
-]
+Evaluate = choice_of(
+    fields=EvaluateFieldsCommand,
+    estimate=EvaluateEstimateCommand,
+    dynamics=EvaluateDynamicsCommand,
+    mpc=EvaluateMpcCommand,
+    relighting=EvaluateRelightingCommand,
+    video=EvaluateVideoCommand,
+    photos=EvaluatePhotosCommand,
+)
 
 
 def _show_methods(report: dict[str, Any], columns: Mapping[str, tuple[str, str]]) -> None:

@@ -6,16 +6,19 @@ import contextlib
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import tyro
 
-from app.cli.command import Command, DataCommand, check_out
+from app.cli.command import Command, DataCommand, check_out, choice_of
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
+from osfcore.geometry.light import Light
+from osfcore.io.files import folder_at_once, write_atomically, write_json
 
 if TYPE_CHECKING:
+    from osfcore.fields.field_library import FieldLibrary
     from osfcore.fields.kiloosf import KiloOSF
-    from osfcore.geometry.light import Light
 
 POSES_FILE = "poses.json"
 
@@ -44,13 +47,14 @@ class ExportScene(DataCommand):
         library, fields = self.assets, self.trained
         scanned = [name for name in scene.state.names if library.has(name) and not self.fields]
         shapes = {n: library.load(n).mesh if n in scanned else fields.load(n) for n in scene.state.names}
-        size = _write(self.out, export(scene, shapes, fields.load_table()))
+        data = export(scene, shapes, fields.load_table())
+        write_atomically(self.out, data)
         others = [name for name in scene.state.names if name not in scanned]
         x, y, z = scene.state.light.direction
-        self.say(f"Wrote {self.out}, {size / 1e6:.1f} MB; light toward ({x:.3f}, {y:.3f}, {z:.3f}).")
+        self.say(f"Wrote {self.out}, {len(data) / 1e6:.1f} MB; light toward ({x:.3f}, {y:.3f}, {z:.3f}).")
         if others:
             self.say(f"Surfaces of fields, with their albedo: {', '.join(others)}.")
-        return {"out": str(self.out), "bytes": size, "meshes": scanned, "fields": others}
+        return {"out": str(self.out), "bytes": len(data), "meshes": scanned, "fields": others}
 
 
 @dataclass(frozen=True)
@@ -73,11 +77,12 @@ class ExportField(DataCommand):
             from osfcore.contrib.export.usd import field_usd
 
             export = partial(field_usd, is_packed=suffix == ".usdz")
-        light, shape = None if self.light is None else _light(self.light), _field(self.name, self.data_dir)
-        size = _write(self.out, export(shape, Path(self.name).stem, light))
+        light = None if self.light is None else Light(np.array(self.light))
+        data = export(_field(self.name, self.trained), Path(self.name).stem, light)
+        write_atomically(self.out, data)
         colours = "the albedo" if light is None else f"those under the light toward {self.light}, baked in"
-        self.say(f"Wrote {self.out}, {size / 1e6:.1f} MB; its colours are {colours}.")
-        return {"out": str(self.out), "bytes": size, "colours": "albedo" if light is None else "baked"}
+        self.say(f"Wrote {self.out}, {len(data) / 1e6:.1f} MB; its colours are {colours}.")
+        return {"out": str(self.out), "bytes": len(data), "colours": "albedo" if light is None else "baked"}
 
 
 @dataclass(frozen=True)
@@ -96,32 +101,17 @@ class ExportSplats(DataCommand):
         from osfcore.contrib.export.splats import field_splats, splats_ply
 
         check_out(self.out, ".ply")
-        splats = field_splats(_field(self.name, self.data_dir), _light(self.light))
-        size, count = _write(self.out, splats_ply(splats)), len(splats.means)
+        splats = field_splats(_field(self.name, self.trained), Light(np.array(self.light)))
+        data, count = splats_ply(splats), len(splats.means)
+        write_atomically(self.out, data)
         self.say(f"Wrote {self.out}, {count} Gaussians; lighting baked in, light toward {self.light}.")
-        return {"out": str(self.out), "bytes": size, "splats": count, "light": splats.light.direction.tolist()}
+        return {"out": str(self.out), "bytes": len(data), "splats": count, "light": splats.light.direction.tolist()}
 
 
-def _light(direction: tuple[float, float, float]) -> Light:
-    import numpy as np
-
-    from osfcore.geometry.light import Light
-
-    return Light(np.array(direction))
-
-
-def _field(name: str, data_dir: Path) -> KiloOSF:
-    from osfcore.fields.field_library import FieldLibrary
+def _field(name: str, library: FieldLibrary) -> KiloOSF:
     from osfcore.fields.kiloosf import read_field
 
-    return read_field(Path(name)) if name.endswith(".safetensors") else FieldLibrary(data_dir).load(name)
-
-
-def _write(out: Path, data: bytes) -> int:
-    from osfcore.io.files import write_atomically
-
-    write_atomically(out, data)
-    return len(data)
+    return read_field(Path(name)) if name.endswith(".safetensors") else library.load(name)
 
 
 @dataclass(frozen=True)
@@ -144,7 +134,6 @@ class ExportPoses(Command):
     def run(self) -> dict[str, Any]:
         """Export; the result has the number of poses."""
         from osfcore.contrib.bop import bop_results
-        from osfcore.io.files import write_atomically
         from osfcore.io.observation_file import read_observation
         from osfcore.io.scene_file import read_estimated
 
@@ -156,13 +145,7 @@ class ExportPoses(Command):
         return {"out": str(self.out), "scene": self.scene, "images": len(cameras), "poses": count}
 
 
-Export = Annotated[
-    Annotated[ExportScene, tyro.conf.subcommand("scene")]
-    | Annotated[ExportField, tyro.conf.subcommand("field")]
-    | Annotated[ExportSplats, tyro.conf.subcommand("splats")]
-    | Annotated[ExportPoses, tyro.conf.subcommand("bop")],
-    tyro.conf.OmitSubcommandPrefixes,
-]
+Export = choice_of(scene=ExportScene, field=ExportField, splats=ExportSplats, bop=ExportPoses)
 
 
 @dataclass(frozen=True)
@@ -189,7 +172,6 @@ class Import(DataCommand):
     def run(self) -> dict[str, Any]:
         """Import; the result lists images, objects, and objects left out."""
         from osfcore.contrib.bop import BopChoice, read_bop_scene
-        from osfcore.io.files import folder_at_once, write_json
         from osfcore.io.observation_file import write_observation
 
         out = self.out.absolute()
@@ -206,11 +188,10 @@ class Import(DataCommand):
             write_json(partial / POSES_FILE, poses)
             write_observation(partial, scene.observation)
         images = [camera.name for camera in scene.observation.cameras]
-        names = list(scene.observation.names)
+        names, left_out = list(scene.observation.names), list(scene.left_out)
         self.say(f"Wrote {self.out}: images {', '.join(images)} of {', '.join(names)}.")
-        if self.names is None and scene.left_out:
-            self.say(f"Left out, as there are no fields of them: {', '.join(scene.left_out)}.")
-        left_out = list(scene.left_out)
+        if self.names is None and left_out:
+            self.say(f"Left out, as there are no fields of them: {', '.join(left_out)}.")
         return {"out": str(self.out), "images": [int(i) for i in images], "objects": names, "left_out": left_out}
 
     def _prior(self, name: str) -> Any:  # noqa: ANN401  TablePrior, which the start of the command line must not load

@@ -6,15 +6,20 @@ import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import tyro
 
-from app.cli.command import Command, DataCommand, check_out, follow
+from app.cli.command import Command, DataCommand, check_out, choice_of, last_of
 from osfcore.errors import InvalidInput, UnknownName, shown
-from osfcore.photo.calibration import Calibration, KnownCamera, read_camera
+from osfcore.io.files import write_atomically, write_json
+from osfcore.io.json_codec import encode
+from osfcore.photo import calibration
+from osfcore.photo.board import Board, board_pdf
 from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
 from osfcore.photo.segmentation import Box, propose_mask
+from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
     from osfcore.geometry.poses import Pose
@@ -33,9 +38,6 @@ class PhotoBoard(Command):
 
     def run(self) -> dict[str, Any]:
         """Write the page."""
-        from osfcore.io.files import write_atomically
-        from osfcore.photo.board import Board, board_pdf
-
         check_out(self.out, ".pdf")
         board = Board()
         write_atomically(self.out, board_pdf(board))
@@ -58,21 +60,18 @@ class PhotoCalibrate(Command):
 
     def run(self) -> dict[str, Any]:
         """Calibrate; the result is what the file holds."""
-        from osfcore.io.files import write_json
-        from osfcore.photo.calibration import board_place, calibrated_camera, calibration_to_json, sight
-
         check_out(self.out, ".json")
-        place = board_place(*self.place)
-        views = [sight(read_photograph(path), path.name) for path in self.photo]
-        table = None if self.table is None else sight(read_photograph(self.table), self.table.name)
-        found = calibrated_camera(views, table, place)
-        result = calibration_to_json(found, self.out.stem)
+        place = calibration.board_place(*self.place)
+        views = [calibration.sight(read_photograph(path), path.name) for path in self.photo]
+        table = None if self.table is None else calibration.sight(read_photograph(self.table), self.table.name)
+        found = calibration.calibrated_camera(views, table, place)
+        result = calibration.calibration_to_json(found, self.out.stem)
         write_json(self.out, result)
         self.say(*_camera_text(found), f"Wrote {self.out}.")
         return result
 
 
-def _camera_text(found: Calibration) -> Iterator[str]:
+def _camera_text(found: calibration.Calibration) -> Iterator[str]:
     """The camera for people, and what would make it better."""
     for name, rms in found.rms_px.items():
         yield f"{name}: corners {rms:.2f} px from where they should appear."
@@ -120,18 +119,14 @@ class PhotoEstimate(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Estimate; the result is what the file holds."""
-        from osfcore.io.files import write_json
-        from osfcore.io.json_codec import encode
         from osfcore.photo.poses import PhotoConfig, PhotoModels, estimate_photo
         from osfcore.photo.summary import summarised
-        from osfcore.random_streams import Stream, stream_rng
 
         photos, starts, notes = self._inputs(self.trained.names())
         names = tuple(dict.fromkeys(name for photo in photos for name in photo.masks))
         models = PhotoModels({name: self.trained.load(name) for name in names})
         rng = stream_rng(self.seed, Stream.PHOTO_SEARCH)
-        last = follow(estimate_photo(models, photos, names, rng, PhotoConfig(starts)))
-        assert last is not None
+        last = last_of(estimate_photo(models, photos, names, rng, PhotoConfig(starts)))
         result = encode(summarised(photos, last, models, notes))
         write_json(self.out, result)
         if self.images is not None:
@@ -152,9 +147,10 @@ class PhotoEstimate(DataCommand):
             OsfError: with a sentence that says what is wrong.
         """
         from osfcore.contrib.bop import PoseChoice, read_poses
+        from osfcore.photo.summary import locate, locate_calibrated
 
         self._check_counts()
-        camera = None if self.camera is None else read_camera(self.camera)
+        camera = None if self.camera is None else calibration.read_camera(self.camera)
         raws = [read_photograph(path) for path in self.photo]
         boxes: list[dict[str, Box]] = [{} for _ in raws]
         for text in self.boxes:
@@ -165,14 +161,16 @@ class PhotoEstimate(DataCommand):
         image = self.image_id[0] if self.image_id else None
         choice = PoseChoice(image, self.scene_id, self.pose_source, self.pose_frame)
         poses = {} if self.poses is None else read_poses(self.poses, choice)
+        masks = [self._masks(known, raw, boxes[number], number) for number, raw in enumerate(raws)]
         photos, notes = [], []
-        masks = [
-            self._masks(known, raw, its, number) for number, (raw, its) in enumerate(zip(raws, boxes, strict=True))
-        ]
         for path, raw, its in zip(self.photo, raws, masks, strict=True):
-            photo, its_notes = _located(path, raw, its, self.focal, camera, is_alone=len(raws) == 1)
-            photos.append(photo)
-            notes += its_notes if len(raws) == 1 else [f"{path.name}: {note}" for note in its_notes]
+            found = locate(raw, self.focal) if camera is None else locate_calibrated(raw, camera)
+            if found.T_world_camera is None and len(raws) > 1:
+                allowed = f"to be seen, since there are several photos ({found.missing.rstrip('.')})"
+                raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed)
+            straight = {name: found.straightened(mask) for name, mask in its.items()}
+            photos.append(to_photograph(found.raw, found.intrinsics, found.T_world_camera, straight))
+            notes += found.notes if len(raws) == 1 else [f"{path.name}: {note}" for note in found.notes]
         names = {name for its in masks for name in its}
         starts = {name: photos[0].T_world_camera @ pose for name, pose in poses.items() if name in names}
         if self.poses is not None:
@@ -199,8 +197,6 @@ class PhotoEstimate(DataCommand):
         self, known: Collection[str], raw: RawPhotograph, boxes: Mapping[str, Box], number: int
     ) -> dict[str, Any]:
         """Masks of one photo: from its folder, and where there is a box from that and a click in its middle."""
-        import numpy as np
-
         from osfcore.contrib.bop import read_masks
 
         masks: dict[str, Any] = {}
@@ -234,27 +230,6 @@ def _box(text: str, paths: Sequence[Path], raws: Sequence[RawPhotograph]) -> tup
     return fitting[0], name, (scale * left, scale * top, scale * right, scale * bottom)
 
 
-def _located(
-    path: Path,
-    raw: RawPhotograph,
-    masks: Mapping[str, Any],
-    focal: float | None,
-    camera: KnownCamera | None,
-    *,
-    is_alone: bool,
-) -> tuple[Photograph, list[str]]:
-    """The photograph with its camera, free of distortion: over the board if it shows one, or as it was calibrated."""
-    from osfcore.photo.summary import locate, locate_calibrated
-
-    found = locate(raw, focal) if camera is None else locate_calibrated(raw, camera)
-    if found.T_world_camera is None and not is_alone:
-        allowed = f"to be seen, since there are several photos ({found.missing.rstrip('.')})"
-        raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed)
-    straight = {name: found.straightened(mask) for name, mask in masks.items()}
-    photo = to_photograph(found.raw, found.intrinsics, found.T_world_camera, straight)
-    return photo, list(found.notes)
-
-
 def _write_sheets(folder: Path, models: PhotoModels, photos: Sequence[Photograph], step: PhotoStep) -> None:
     """NAME.png, or NAME-1.png and so on for each photo with a mask of it."""
     from osfcore.inspection.contact_sheet import write_sheet
@@ -273,18 +248,13 @@ def _summary(result: dict[str, Any]) -> Iterator[str]:
         yield f"{entry['name']} at {x:.1f}, {y:.1f}, {z:.1f} cm; its outline fits by {100 * entry['iou']:.0f} %."
         if entry["doubt"]:
             yield f"  {entry['doubt']}"
-    if result["light"] and result["light"]["diffuse"]:
+    light = result["light"]
+    if light and light["diffuse"]:
         yield "The light is diffuse: nothing speaks for one lamp."
-    elif result["light"]:
-        light = result["light"]
+    elif light:
         far = f", {light['distance_m']:.2f} m away" if light["distance_m"] is not None else ""
         yield f"Toward the lamp: {json.dumps([round(v, 2) for v in light['direction']])}{far}."
     yield from result["notes"]
 
 
-Photo = Annotated[
-    Annotated[PhotoBoard, tyro.conf.subcommand("board")]
-    | Annotated[PhotoCalibrate, tyro.conf.subcommand("calibrate")]
-    | Annotated[PhotoEstimate, tyro.conf.subcommand("estimate")],
-    tyro.conf.OmitSubcommandPrefixes,
-]
+Photo = choice_of(board=PhotoBoard, calibrate=PhotoCalibrate, estimate=PhotoEstimate)

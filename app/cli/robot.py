@@ -10,17 +10,18 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand, Device
-from osfcore.errors import InvalidInput
+from app.cli.command import Command, DataCommand, Device, choice_of
+from osfcore.errors import InvalidInput, check_seed, shown
+from osfcore.io.output_paths import check_place
 
 if TYPE_CHECKING:
     from app.episodes.robot import RobotDrive
     from osfcore.contrib.robots.guarded_world import CameraBoxes
-    from osfcore.contrib.robots.robot import Robot, RobotDescription, SafetyLimits
+    from osfcore.contrib.robots.robot import Robot, RobotDescription
     from osfcore.geometry.states import Observation
 
 _LOOKS = 3
@@ -41,19 +42,18 @@ class RobotCheck(Command):
         """Look some times; the result has cameras, limits and how long a look takes."""
         from app.episodes.robot import doubts_about
         from osfcore.contrib.robots.connect import connect
-        from osfcore.io.output_paths import check_place
 
-        if self.out is not None:
-            check_place(self.out / "overlay.png")
+        overlay = None if self.out is None else self.out / "overlay.png"
+        if overlay is not None:
+            check_place(overlay)
         with contextlib.closing(connect(self.url)) as robot:
             looks = [_timed_look(robot) for _ in range(_LOOKS)]
         seen, seconds = looks[-1][0], [look[1] for look in looks]
         about, doubts = robot.description, doubts_about(robot.description)
-        if self.out is not None:
-            _write_pictures(self.out, seen)
+        if overlay is not None:
+            _write_pictures(overlay, seen)
         self.say(*self._described(about, seen, min(seconds)), *doubts)
-        if self.out is not None:
-            overlay = self.out / "overlay.png"
+        if overlay is not None:
             self.say(f"{overlay}: the axes must stand in the middle of the table, the yellow stroke in the pusher.")
         assert seen.pusher is not None
         return {
@@ -141,24 +141,20 @@ class RobotDriveCommand(DataCommand):
     def _order(self) -> Any:  # noqa: ANN401  a DriveOrder, whose module is heavy
         from app.episodes.file_names import REPORT_FILE
         from app.episodes.robot import DriveOrder
+        from osfcore.contrib.robots.robot import SafetyLimits
         from osfcore.control.events import EpisodeSettings
-        from osfcore.errors import check_seed
         from osfcore.fields.devices import pick_device
-        from osfcore.io.output_paths import check_place
         from osfcore.planning.mppi import PlanSettings
 
         plan = PlanSettings(self.samples, self.horizon)
         settings = EpisodeSettings(self.steps, plan=plan, despite_doubts=self.despite_doubts)
         check_place(self.out / REPORT_FILE)
+        boxes, speed = read_boxes(self.boxes), self.top_speed
+        limits = SafetyLimits(top_speed_m_s=speed) if self.box is None else SafetyLimits(self.box, speed)
         return DriveOrder(
             self.url, self.names, self.goal, self.out, self.data_dir, self.goal_camera, self.goal_encoding,
-            read_boxes(self.boxes), self._limits(), check_seed(self.seed), settings, str(pick_device(self.device)),
+            boxes, limits, check_seed(self.seed), settings, str(pick_device(self.device)),
         )  # fmt: skip
-
-    def _limits(self) -> SafetyLimits:
-        from osfcore.contrib.robots.robot import SafetyLimits
-
-        return SafetyLimits(top_speed_m_s=self.top_speed, **({} if self.box is None else {"box": self.box}))
 
 
 def _timed_look(robot: Robot) -> tuple[Observation, float]:
@@ -198,16 +194,15 @@ def _asked(drive: RobotDrive, url: str) -> bool:
         return False
 
 
-def _write_pictures(folder: Path, seen: Observation) -> None:
-    """All cameras with the table's axes, and what each sees as cameras encode it."""
-    from osfcore.errors import shown
+def _write_pictures(overlay: Path, seen: Observation) -> None:
+    """All cameras with the table's axes, and beside that what each sees as cameras encode it."""
     from osfcore.estimation.camera_response import srgb_of_linear
     from osfcore.inspection.overlays import observation_sheet
     from osfcore.io.image_file import to_uint8, write_png
 
-    write_png(folder / "overlay.png", observation_sheet(seen)[..., ::-1])
+    write_png(overlay, observation_sheet(seen)[..., ::-1])
     for camera, image in zip(seen.cameras, seen.images, strict=True):
-        write_png(folder / f"{shown(camera.name).replace('/', '_')}.png", to_uint8(srgb_of_linear(image)))
+        write_png(overlay.with_name(f"{shown(camera.name).replace('/', '_')}.png"), to_uint8(srgb_of_linear(image)))
 
 
 @contextlib.contextmanager
@@ -249,7 +244,4 @@ def _listen(stop: Callable[[str], None], terminal: int, ended: threading.Event) 
             return
 
 
-RobotCommand = Annotated[
-    Annotated[RobotCheck, tyro.conf.subcommand("check")] | Annotated[RobotDriveCommand, tyro.conf.subcommand("drive")],
-    tyro.conf.OmitSubcommandPrefixes,
-]
+RobotCommand = choice_of(check=RobotCheck, drive=RobotDriveCommand)

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from types import FrameType
 
     import uvicorn
-    from fastapi import FastAPI
 
     from app.services.service_settings import Settings
 
@@ -181,8 +180,12 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
     class Server(uvicorn.Server):
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets)
-            if self.started:
-                _print_address(app, url)
+            if not self.started:
+                return
+            if not app.state.services.objects.names():
+                missing = "There are no objects on this machine yet; fetch them on the page or with 'osf assets fetch'."
+                print(missing, file=sys.stderr, flush=True)
+            print(url, flush=True)
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             if self.should_exit:  # who asks twice does not want to wait for anything
@@ -208,16 +211,6 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
             proxy_headers=True,
         )
     )
-
-
-def _print_address(app: FastAPI, url: str) -> None:
-    if not app.state.services.objects.names():
-        print(
-            "There are no objects on this machine yet; fetch them on the page or with 'osf assets fetch'.",
-            file=sys.stderr,
-            flush=True,
-        )
-    print(url, flush=True)
 
 
 def _url(host: str, port: int) -> str:

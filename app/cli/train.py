@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
-
-from app.cli.command import Command, DataCommand, Device, follow, options_as
+from app.cli.command import Command, DataCommand, Device, Seed, choice_of, follow, options_as
 from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput
 from osfcore.io.output_paths import SUFFIX
@@ -34,8 +31,7 @@ class TrainFieldCommand(Command):
     minutes: float = 30.0
     """How long to train each [min]."""
     device: Device = "auto"
-    seed: int = 0
-    """Of everything random."""
+    seed: Seed = 0
     hollow: bool = False
     """The object has hollows that no silhouette shows, such as a bowl's."""
     iterations: int | None = None
@@ -56,20 +52,26 @@ class TrainFieldCommand(Command):
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result has PSNR [dB] on the test images, size and time."""
         places = self._places()
-        outs = [out for _, out in places]
         settings, train = self._paper(places) if self.method == "paper" else self._ours(places)
         workers = min(self.workers, len(places))
         with worker_pool(workers, self.cluster) as executor:
             if len(places) == 1 and executor is None:
                 follow(train(settings[0]))
             else:
-                follow(self._several(settings, train, executor, workers))
-        found = {out.stem: _metrics(out) for out in outs}
-        for out, metrics in zip(outs, found.values(), strict=True):
+                from torch import get_num_threads
+
+                from osfcore.fields.train_several import train_several
+
+                shares_disk = self.cluster is None
+                threads = max(1, get_num_threads() // workers) if shares_disk else 1
+                follow(train_several(settings, train, executor, threads=threads, shares_disk=shares_disk))
+        found = {}
+        for _, out in places:
+            found[out.stem] = metrics = _metrics(out)
             full, mask = metrics["psnr_full"], metrics["psnr_mask"]
             quality = f"{full:.1f} dB on unseen views and lights, {mask:.1f} dB in the mask"
             self.say(f"Wrote {out}: {quality}, {metrics['bytes'] / 1e6:.2f} MB.")
-        return {"out": str(self.out), **(found[self.out.stem] if len(outs) == 1 else {"fields": found})}
+        return {"out": str(self.out), **(found[self.out.stem] if len(places) == 1 else {"fields": found})}
 
     def _places(self) -> list[tuple[Path, Path]]:
         """Each image set with the file to write."""
@@ -83,34 +85,18 @@ class TrainFieldCommand(Command):
             raise InvalidInput("output of several image sets", self.out, "a folder")
         return [(data, self.out / f"{name}{SUFFIX}") for data, name in zip(self.data, names, strict=True)]
 
-    def _several(
-        self, settings: Sequence[FieldSettings], train: TrainOne, executor: Executor | None, workers: int
-    ) -> Iterator[Progress]:
-        from torch import get_num_threads
-
-        from osfcore.fields.train_several import train_several
-
-        threads = 1 if self.cluster is not None else max(1, get_num_threads() // workers)
-        return train_several(settings, train, executor, threads=threads, shares_disk=self.cluster is None)
-
     def _ours(self, places: Sequence[tuple[Path, Path]]) -> tuple[Sequence[FieldSettings], TrainOne]:
         from osfcore.fields.train_kiloosf import TrainField, train_field
 
-        given = {"hollow": self.hollow, "recipe": self.recipe, "lit": self.method != "nerf", **self._common()}
-        return [TrainField(data, out, **given) for data, out in places], train_field
+        lit = self.method != "nerf"
+        return [options_as(TrainField, self, data=data, out=out, lit=lit) for data, out in places], train_field
 
     def _paper(self, places: Sequence[tuple[Path, Path]]) -> tuple[Sequence[FieldSettings], TrainOne]:
         from osfcore.fields.train_osf import FieldSettings
         from osfcore.paper.train_fields import train_paper_field
 
-        for option, is_given in (("--hollow", self.hollow), ("--recipe", self.recipe != "direct")):
-            if is_given:
-                raise InvalidInput(f"option {option}", "given", "left out with --method paper, which has no such thing")
-        return [FieldSettings(data, out, **self._common()) for data, out in places], train_paper_field
-
-    def _common(self) -> dict[str, Any]:
-        names = ("minutes", "device", "seed", "iterations", "teacher_width", "teacher_depth")
-        return {name: getattr(self, name) for name in names}
+        _refuse_with_paper(hollow=self.hollow, recipe=self.recipe != "direct")
+        return [options_as(FieldSettings, self, data=data, out=out) for data, out in places], train_paper_field
 
 
 @dataclass(frozen=True)
@@ -122,8 +108,7 @@ class TrainTableCommand(Command):
     out: Path
     """File to write, such as table.safetensors; its metrics go beside it as .json."""
     device: Device = "auto"
-    seed: int = 0
-    """Of everything random."""
+    seed: Seed = 0
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result holds the metrics."""
@@ -162,8 +147,7 @@ class TrainDynamicsCommand(DataCommand):
     rate: float | None = None
     """Of learning, at its highest (ours 0.004, paper 0.001)."""
     device: Device = "auto"
-    seed: int = 0
-    """Of everything random."""
+    seed: Seed = 0
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result holds the metrics."""
@@ -177,24 +161,20 @@ class TrainDynamicsCommand(DataCommand):
         from osfcore.dynamics.rollout import load_shapes
         from osfcore.dynamics.train import TrainDynamics, train_dynamics
 
-        given = self._given("iterations", "long_iterations", "patience", "hidden", "batch", "long_batch", "rate")
-        config = TrainDynamics(self.data, self.out, without=self.without, device=self.device, seed=self.seed, **given)
+        config = options_as(TrainDynamics, self)
         return train_dynamics(config, load_shapes(self.data_dir, self.trained, self.trained.names()))
 
     def _train_paper(self) -> Iterator[Progress]:
         from osfcore.paper.dynamics import longest_axes
         from osfcore.paper.train_dynamics import TrainPaperDynamics, train_paper_dynamics
 
-        for name in (*self._given("long_iterations", "long_batch"), *(("without",) if self.without else ())):
-            option = f"--{name.replace('_', '-')}"
-            raise InvalidInput(f"option {option}", "given", "left out with --method paper, which has no such thing")
-        given = self._given("iterations", "patience", "hidden", "batch", "rate")
-        config = TrainPaperDynamics(self.data, self.out, device=self.device, seed=self.seed, **given)
+        _refuse_with_paper(
+            long_iterations=self.long_iterations is not None,
+            long_batch=self.long_batch is not None,
+            without=bool(self.without),
+        )
+        config = options_as(TrainPaperDynamics, self)
         return train_paper_dynamics(config, longest_axes(self.trained, self.trained.names()))
-
-    def _given(self, *names: str) -> dict[str, Any]:
-        """Those of some options that were given; the others are the method's own defaults."""
-        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
 @dataclass(frozen=True)
@@ -228,30 +208,32 @@ class TrainFitVidCommand(Command):
     measured: int = 32
     """Held-out videos to measure on in the end, at most."""
     device: Device = "auto"
-    seed: int = 0
-    """Of everything random."""
+    seed: Seed = 0
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result holds the metrics."""
         from osfcore.experiments.rivals.train_fitvid import TrainFitVid, train_fitvid
 
         follow(train_fitvid(options_as(TrainFitVid, self)))
-        out = self.out
-        metrics = _metrics(out)
+        metrics = _metrics(self.out)
         for horizon, means in metrics["horizons"].items():
             psnr = f"{means['psnr']:.1f} dB (the last known frame, copied: {means['psnr_copied']:.1f} dB)"
-            self.say(f"Wrote {out}: held out, over {horizon} steps, {psnr}.")
-        return {"out": str(out), **metrics}
+            self.say(f"Wrote {self.out}: held out, over {horizon} steps, {psnr}.")
+        return {"out": str(self.out), **metrics}
+
+
+def _refuse_with_paper(**given: bool) -> None:
+    """Refuse options that were given and that the paper's method does not have."""
+    for name, is_given in given.items():
+        if is_given:
+            option = f"option --{name.replace('_', '-')}"
+            raise InvalidInput(option, "given", "left out with --method paper, which has no such thing")
 
 
 def _metrics(out: Path) -> dict[str, Any]:
     return json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
 
 
-Train = Annotated[
-    Annotated[TrainFieldCommand, tyro.conf.subcommand("field")]
-    | Annotated[TrainTableCommand, tyro.conf.subcommand("table")]
-    | Annotated[TrainDynamicsCommand, tyro.conf.subcommand("dynamics")]
-    | Annotated[TrainFitVidCommand, tyro.conf.subcommand("fitvid")],
-    tyro.conf.OmitSubcommandPrefixes,
-]
+Train = choice_of(
+    field=TrainFieldCommand, table=TrainTableCommand, dynamics=TrainDynamicsCommand, fitvid=TrainFitVidCommand
+)

@@ -9,7 +9,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnContext, SpawnProcess
 
@@ -40,7 +40,10 @@ def worker_pool(
         return
     if not 1 <= workers <= MAX_WORKERS:
         raise InvalidInput("number of workers", workers, f"between 1 and {MAX_WORKERS}")
-    executor = _processes(workers) if workers > 1 else None
+    executor = None
+    if workers > 1:
+        with suppress(OSError):  # no shared memory, as in some sandboxes: slower, but it works
+            executor = ProcessPoolExecutor(workers, mp_context=_Workers(), initializer=_end_with_parent)
     try:
         yield executor
     except KeyboardInterrupt:  # a piece of work may take minutes
@@ -91,13 +94,6 @@ class _Worker(SpawnProcess):
 
 class _Workers(SpawnContext):
     Process = _Worker
-
-
-def _processes(workers: int) -> Executor | None:
-    try:
-        return ProcessPoolExecutor(workers, mp_context=_Workers(), initializer=_end_with_parent)
-    except OSError:  # no shared memory, as in some sandboxes: slower, but it works
-        return None
 
 
 def _end_with_parent() -> None:
