@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from fastapi import Depends, FastAPI, Request
@@ -91,19 +89,15 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         generate_unique_id_function=_operation_id,
     )
     app.state.settings, app.state.metrics = settings, status.Metrics()
-    limit_of = partial(_body_limit, settings)
     app.add_middleware(events.DepartureMiddleware)
     app.add_middleware(CompressionMiddleware)
     app.add_middleware(HeadMiddleware)
     app.add_middleware(BodyTimeoutMiddleware)
-    app.add_middleware(BodyLimitMiddleware, limit_of=limit_of)
+    app.add_middleware(BodyLimitMiddleware, limit_of=partial(_body_limit, settings))
     if settings.token is not None:
         app.add_middleware(TokenMiddleware, token=settings.token.get_secret_value())
-    app.add_middleware(  # outermost: also the limit's answer gets its headers and becomes a problem
-        SecurityMiddleware,
-        allowed_hosts=settings.allowed_hosts,
-        allowed_origins=settings.allowed_origins,
-        limit_of=limit_of,
+    app.add_middleware(  # outside of the limit and the token, whose refusals get its headers, too
+        SecurityMiddleware, allowed_hosts=settings.allowed_hosts, allowed_origins=settings.allowed_origins
     )
     app.add_middleware(status.MetricsMiddleware, metrics=app.state.metrics)
     problems.install(app)
@@ -159,7 +153,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
         )
         schema["security"] = [{}, *({name: []} for name in _SECURITY)]
         schema["components"]["securitySchemes"] = _SECURITY
-        schemas = schema.setdefault("components", {}).setdefault("schemas", {})
+        schemas = schema["components"]["schemas"]
         for model in _OTHER_MODELS:
             own = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= own.pop("$defs", {})
@@ -177,10 +171,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
 
 def _add_docs(app: FastAPI) -> None:
     """Swagger UI with scripts from a package on this machine."""
-    package = importlib.util.find_spec("fastapi_offline")
-    assert package is not None
-    assert package.origin is not None
-    app.mount("/docs-assets", StaticFiles(directory=Path(package.origin).parent / "static"), name="docs-assets")
+    app.mount("/docs-assets", StaticFiles(packages=[("fastapi_offline", "static")]), name="docs-assets")
 
     @app.get("/docs", include_in_schema=False)
     async def docs(request: Request) -> HTMLResponse:

@@ -7,9 +7,9 @@ import functools
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -42,8 +42,7 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import CATALOGUE
 
 Result = TypeVar("Result")
-_SLOW_THREADS, _SLOW_WAITING = 8, 64
-_URGENT_THREADS, _URGENT_WAITING = 8, 256
+Source = TypeVar("Source")
 
 
 class Lane:
@@ -57,8 +56,7 @@ class Lane:
 
     def __init__(self, name: str, threads: int, waiting: int) -> None:
         self._executor = ThreadPoolExecutor(threads, thread_name_prefix=name)
-        self._most = threads + waiting
-        self._inside = 0  # touched by the event loop only
+        self._places = threading.Semaphore(threads + waiting)
 
     async def run(self, function: Callable[..., Result], *arguments: Any, **named: Any) -> Result:  # noqa: ANN401
         """Call a function in a thread of this lane.
@@ -66,53 +64,31 @@ class Lane:
         Raises:
             ProcessBusy: if too many wait already.
         """
-        if self._inside >= self._most:
+        if not self._places.acquire(blocking=False):
             raise ProcessBusy("service")
-        loop = asyncio.get_running_loop()
-        future = self._executor.submit(functools.partial(function, *arguments, **named))
-        self._inside += 1
-        future.add_done_callback(functools.partial(self._leave, loop))  # not when the client leaves: the thread goes on
+        future = self._executor.submit(function, *arguments, **named)
+        future.add_done_callback(lambda _: self._places.release())  # not when the client leaves: the thread goes on
         return await asyncio.wrap_future(future)
 
     def close(self) -> None:
         """Take nothing more; threads end with what they do."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
-    def _leave(self, loop: asyncio.AbstractEventLoop, _: Future[Any]) -> None:
-        if not loop.is_closed():
-            loop.call_soon_threadsafe(self._count_out)
-
-    def _count_out(self) -> None:
-        self._inside -= 1
-
-
-class Lanes:
-    """The lanes of one app: `slow` for what waits for a child process, `urgent` for what ends or holds work."""
-
-    def __init__(self) -> None:
-        self.slow = Lane("slow", _SLOW_THREADS, _SLOW_WAITING)
-        self.urgent = Lane("urgent", _URGENT_THREADS, _URGENT_WAITING)
-
-    def close(self) -> None:
-        """Take nothing more."""
-        self.slow.close()
-        self.urgent.close()
-
 
 def slow(handler: Callable[..., Result]) -> Callable[..., Any]:
     """Mark a route's handler, which takes `services`, as one that waits for a child process."""
-    return _in_lane(handler, lambda lanes: lanes.slow)
+    return _in_lane(handler, lambda services: services.slow_lane)
 
 
 def urgent(handler: Callable[..., Result]) -> Callable[..., Any]:
     """Mark a route's handler, which takes `services`, as one that must be served whatever others do."""
-    return _in_lane(handler, lambda lanes: lanes.urgent)
+    return _in_lane(handler, lambda services: services.urgent_lane)
 
 
-def _in_lane(handler: Callable[..., Result], choose: Callable[[Lanes], Lane]) -> Callable[..., Any]:
+def _in_lane(handler: Callable[..., Result], lane_of: Callable[[Services], Lane]) -> Callable[..., Any]:
     @functools.wraps(handler)
     async def handle(*, services: Services, **named: Any) -> Result:  # noqa: ANN401  the handler's own
-        return await choose(services.lanes).run(handler, services=services, **named)
+        return await lane_of(services).run(handler, services=services, **named)
 
     return handle
 
@@ -134,39 +110,23 @@ class EventTexts:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._kept: OrderedDict[int, tuple[object, str]] = OrderedDict()
-        self._streams = 0
 
-    def of(self, source: object, make: Callable[[], BaseModel]) -> str:
+    def of(self, source: Source, make: Callable[[Source], BaseModel]) -> str:
         """The JSON of what `make` returns, which was perhaps made for another stream just now.
 
         Args:
             source: frozen; what it is made of.
-            make: called if it has not been made yet.
+            make: called with it if it has not been made yet.
         """
         known = self._kept.get(id(source))
         if known is not None:
             return known[1]
-        text = make().model_dump_json()
+        text = make(source).model_dump_json()
         with self._lock:
             self._kept[id(source)] = source, text  # holding the source keeps its identity from being used again
             if len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return text
-
-    @contextmanager
-    def stream(self) -> Iterator[None]:
-        """Count one stream.
-
-        Raises:
-            TooManyStreams: if there are too many.
-        """
-        if self._streams >= MAX_STREAMS:
-            raise TooManyStreams
-        self._streams += 1
-        try:
-            yield
-        finally:
-            self._streams -= 1
 
 
 VISITOR_HEADER = "X-OSF-Visitor"
@@ -212,7 +172,9 @@ class Services:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.event_texts = EventTexts()
-        self.lanes = Lanes()
+        self.streams = threading.Semaphore(MAX_STREAMS)  # each event stream takes one while it lasts
+        self.slow_lane = Lane("slow", threads=8, waiting=64)  # for what waits for a child process
+        self.urgent_lane = Lane("urgent", threads=8, waiting=256)  # for what ends or holds work
         self.closing = threading.Event()  # event streams end when it is set
         self._stops = ExitStack()
 
@@ -258,7 +220,8 @@ class Services:
         self.own_objects = OwnObjects(self.runner)
         self.outliner = Outliner(self.runner.library)
         self.disturber = Disturber(self.runner.scenes, np.random.default_rng())
-        stack.callback(self.lanes.close)
+        stack.callback(self.urgent_lane.close)
+        stack.callback(self.slow_lane.close)
         stack.callback(self.closing.set)
 
     def stop(self) -> None:

@@ -336,10 +336,9 @@ async def _unended(job: FoundDep, last_event_id: LastEventId = None) -> Job:
 
 @router.get("/{episode}/events", response_class=EventSourceResponse, responses={**problems(404, 503), **SEEN})
 async def follow(
-    services: ServicesDep, job: Annotated[Job, Depends(_unended)], counted: StreamDep
+    services: ServicesDep, job: Annotated[Job, Depends(_unended)], _: StreamDep
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow one episode: "job" events as at /api/events, from how it is now to its end."""
-    del counted
     async for event in followed(services, job):
         yield event
 

@@ -153,7 +153,6 @@ _BODY = {
 }
 router = APIRouter(prefix=UPLOAD_PATH, tags=["estimates"], responses=problems())
 _UPLOAD_DEFAULTS = {"mode": "first", "seed": "0", "file_name": "observation.zip", "method": "ours"}
-View = Annotated[int, Path(ge=0, le=1000, description="Number of the camera, from 0.")]
 
 
 async def _known_job(
@@ -195,7 +194,7 @@ async def create(
         job = await services.estimates.of_upload(Asked(mode, seed, prior, method), request.stream(), file_name)
     else:
         request_body = await _body(request, kind)
-        job = await services.lanes.slow.run(services.estimates.of_scene, request_body.asked(), request_body.scene)
+        job = await services.slow_lane.run(services.estimates.of_scene, request_body.asked(), request_body.scene)
     response.headers["Location"] = f"{UPLOAD_PATH}/{job.id}"
     return await asyncio.to_thread(_out, services.estimates, job)
 
@@ -235,10 +234,9 @@ async def _unended(job: FoundDep, last_event_id: LastEventId = None) -> Job:
 
 @router.get("/{estimate}/events", response_class=EventSourceResponse, responses={**problems(404, 503), **SEEN})
 async def follow(
-    services: ServicesDep, job: Annotated[Job, Depends(_unended)], counted: StreamDep
+    services: ServicesDep, job: Annotated[Job, Depends(_unended)], _: StreamDep
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow one estimate: "job" events as at /api/events, from how it is now to its end."""
-    del counted
     async for event in followed(services, job):
         yield event
 
@@ -247,7 +245,7 @@ async def follow(
 async def image(
     services: ServicesDep,
     job: FoundDep,
-    view: View,
+    view: Annotated[int, Path(ge=0, le=1000, description="Number of the camera, from 0.")],
     kind: Annotated[
         Literal["observed", "rendered", "difference", "comparison"],
         Query(description="The difference is absolute, times 4; a comparison is all three side by side."),

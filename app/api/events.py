@@ -8,6 +8,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import AsyncIterator
+from contextlib import ExitStack
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -18,7 +19,7 @@ from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from app.api.dependencies import Services, ServicesDep
+from app.api.dependencies import Services, ServicesDep, TooManyStreams
 from app.api.goals import DraftOut
 from app.api.jobs import JobOut
 from app.api.models import Visitor
@@ -30,7 +31,7 @@ from app.jobs.kinds import KINDS
 from app.processes.messages.scene_messages import FramesTaken, SceneChanged
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
-from app.services.goals import DraftChanged, GoalsChanged
+from app.services.goals import Draft, DraftChanged, GoalsChanged
 from app.services.photos import PhotosChanged
 from app.storage.paths import without_places
 from osfcore.control.events import Looking
@@ -93,7 +94,7 @@ SCENE_INTERVAL_S = 0.1
 FRAME_INTERVAL_S = 0.2
 LOOK_INTERVAL_S = 0.3
 _MAX_WAITING = 1000  # job events that a slow page may lag behind; the oldest are dropped
-_LOOK_INTERVAL_S = 0.5
+_WAIT_S = 0.5  # for something to come, before a stream looks whether the service ends
 _MAX_EVENT = 2**63 - 1
 _END = "end"  # the identifier of the last event of a job's own stream
 LastEventId = Annotated[str | None, Header(description="Identifier of the last event that was seen.")]
@@ -102,8 +103,12 @@ Letter = JobChanged | JobForgotten | Notice | GoalsChanged | PhotosChanged | Dri
 
 
 async def _counted(services: ServicesDep) -> AsyncIterator[None]:
-    with services.event_texts.stream():
+    if not services.streams.acquire(blocking=False):
+        raise TooManyStreams
+    try:
         yield
+    finally:
+        services.streams.release()
 
 
 StreamDep = Annotated[None, Depends(_counted)]
@@ -148,16 +153,11 @@ class Mailbox:
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._put, event)
 
-    async def next_job(self, job: str) -> JobChanged | None:
-        """The next letter about a job; None if there is none for a while."""
-        while self.letters:
-            letter = self.letters.popleft()
-            if isinstance(letter, JobChanged) and letter.job.id == job:
-                return letter
+    async def wait(self) -> None:
+        """Wait until something comes, for a while."""
         self.arrived.clear()
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self.arrived.wait(), _LOOK_INTERVAL_S)
-        return None
+            await asyncio.wait_for(self.arrived.wait(), _WAIT_S)
 
     def _put(self, event: object) -> None:
         match event:
@@ -168,40 +168,39 @@ class Mailbox:
             case CurrentScene(record):
                 self._current = None if record is None else record.id
                 self.is_scene_new, self.frames, self.look = True, None, None
-            case SceneChanged(record):
-                self.is_scene_new = self.is_scene_new or record.id == self._current
+            case SceneChanged(record) if record.id == self._current:
+                self.is_scene_new = True
             case JobView(job, Looking() as look) if job.scene in (None, self._current):
                 self.look = look
-            case FramesTaken():
-                self.frames = event if event.scene == self._current else self.frames
+            case FramesTaken() if event.scene == self._current:
+                self.frames = event
         self.arrived.set()
 
 
 @router.get("/events", response_class=EventSourceResponse, responses=problems(503))
 async def stream(
     services: ServicesDep,
-    counted: StreamDep,
+    _: StreamDep,
     frames: Annotated[bool, Query(description="Whether live images are wanted.")] = False,
     visitor: Annotated[Visitor | None, Query(description="What the page calls itself.")] = None,
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow what happens: job, look, forgotten, scene, frame, goals, photos, draft, driver, notice."""
-    del counted
     mailbox = Mailbox(services.runner.scenes.current)
-    leave = services.runner.hub.subscribe(mailbox.put)
-    is_watching = has_arrived = False
-    try:
+    with ExitStack() as departure:
+        departure.callback(services.runner.hub.subscribe(mailbox.put))
         if frames:
-            is_watching = True  # before the call: a page that leaves during it must be counted out again
+            # In this order: a page that leaves while it is counted in must be counted out again.
+            departure.callback(services.runner.scenes.watch_frames, -1)
             await run_in_threadpool(services.runner.scenes.watch_frames, 1)
         if visitor is not None:
-            has_arrived = True
+            departure.callback(services.driver.leave, visitor)
             services.driver.arrive(visitor)
         yield ServerSentEvent(comment="connected", retry=1000)
         for entry in services.store.set_aside:
             yield ServerSentEvent(event="notice", data=NoticeEvent(level="warning", text=entry.sentence))
         if services.goals.draft is not None:
-            yield _draft_event(services, DraftChanged(services.goals.draft))
+            yield _draft_event(services, services.goals.draft)
         last = 0
         if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
             last = min(int(last_event_id[:19]), _MAX_EVENT)
@@ -212,12 +211,6 @@ async def stream(
                     yield replayed
         async for event in _follow(services, mailbox, last, wants_frames=frames):
             yield event
-    finally:
-        leave()
-        if visitor is not None and has_arrived:
-            services.driver.leave(visitor)
-        if is_watching:
-            services.runner.scenes.watch_frames(-1)
 
 
 async def _follow(
@@ -229,7 +222,9 @@ async def _follow(
             letter = mailbox.letters.popleft()
             match letter:
                 case Notice():
-                    yield _notice_event(services, letter)
+                    text = without_places(letter.text, services.settings.data_dir)
+                    notice = NoticeEvent.model_validate({"level": letter.level, "text": text})
+                    yield ServerSentEvent(event="notice", data=notice)
                 case GoalsChanged():
                     yield ServerSentEvent(event="goals", raw_data="null")
                 case PhotosChanged():
@@ -237,12 +232,12 @@ async def _follow(
                 case DriverChanged():
                     yield ServerSentEvent(event="driver", data=DriverOut.model_validate(letter, from_attributes=True))
                 case JobChanged() if letter.event == 0 or letter.event > last:  # not replayed already
-                    yield job_event(services, letter.event, letter.job)
+                    yield _job_event(services, letter.job, str(letter.event) if letter.event else None)
                 case JobForgotten() if letter.event > last:
                     yield _forgotten(letter.event, letter.job.id)
         if mailbox.draft is not None:
             changed, mailbox.draft = mailbox.draft, None
-            yield _draft_event(services, changed)
+            yield _draft_event(services, changed.draft)
         now = time.monotonic()
         if mailbox.is_scene_new and now >= scene_at:
             mailbox.is_scene_new, scene_at = False, now + SCENE_INTERVAL_S
@@ -250,23 +245,17 @@ async def _follow(
         if mailbox.frames is not None and now >= frame_at:
             taken, mailbox.frames, frame_at = mailbox.frames, None, now + FRAME_INTERVAL_S
             if wants_frames:
-                text = services.event_texts.of(taken, partial(_frame, taken))
-                yield ServerSentEvent(event="frame", raw_data=text)
+                yield ServerSentEvent(event="frame", raw_data=services.event_texts.of(taken, _frame))
         if mailbox.look is not None and (now >= look_at or mailbox.look.step.estimate is not None):
             look, mailbox.look, look_at = mailbox.look, None, now + LOOK_INTERVAL_S
-            text = await run_in_threadpool(services.event_texts.of, look, partial(_look, services, look))
+            text = await run_in_threadpool(services.event_texts.of, look, partial(_look, services))
             yield ServerSentEvent(event="look", raw_data=text)
-        mailbox.arrived.clear()
         due = [scene_at] * mailbox.is_scene_new + [frame_at] * (mailbox.frames is not None)
         due += [look_at] * (mailbox.look is not None)
-        timeout = min([_LOOK_INTERVAL_S, *(max(at - time.monotonic(), 0.001) for at in due)])
         if due:
-            await asyncio.sleep(timeout)
+            await asyncio.sleep(min(max(min(due) - time.monotonic(), 0.001), _WAIT_S))
         elif not mailbox.letters:
-            try:
-                await asyncio.wait_for(mailbox.arrived.wait(), timeout)
-            except TimeoutError:
-                continue
+            await mailbox.wait()
 
 
 async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEvent]:
@@ -276,20 +265,17 @@ async def followed(services: Services, job: Job) -> AsyncIterator[ServerSentEven
     try:
         with contextlib.suppress(UnknownName):  # one that was just removed for good ends as it was
             job = services.runner.jobs.get(job.id)  # again, now that nothing is missed
-        now = job
-        yield _event_of(services, now)
-        while not now.is_finished and not services.closing.is_set():
-            letter = await mailbox.next_job(job.id)
-            if letter is not None:
-                now = letter.job
-                yield _event_of(services, now)
+        yield _job_event(services, job, _END if job.is_finished else None)
+        while not job.is_finished and not services.closing.is_set():
+            if not mailbox.letters:
+                await mailbox.wait()
+                continue
+            letter = mailbox.letters.popleft()
+            if isinstance(letter, JobChanged) and letter.job.id == job.id:
+                job = letter.job
+                yield _job_event(services, job, _END if job.is_finished else None)
     finally:
         leave()
-
-
-def _event_of(services: Services, job: Job) -> ServerSentEvent:
-    text = services.event_texts.of(job, partial(JobOut.of, job))
-    return ServerSentEvent(event="job", id=_END if job.is_finished else None, raw_data=text)
 
 
 def unended(job: Job, last_event_id: str | None) -> Job:
@@ -303,21 +289,8 @@ def unended(job: Job, last_event_id: str | None) -> Job:
     return job
 
 
-def job_event(services: Services, number: int, job: Job) -> ServerSentEvent:
-    """A job as an event.
-
-    Args:
-        services: of the app.
-        number: of the event; 0 where nothing came after it that could be asked for.
-        job: as it was then.
-    """
-    text = services.event_texts.of(job, partial(JobOut.of, job))
-    return ServerSentEvent(event="job", id=str(number) if number else None, raw_data=text)
-
-
-def _notice_event(services: Services, notice: Notice) -> ServerSentEvent:
-    text = without_places(notice.text, services.settings.data_dir)
-    return ServerSentEvent(event="notice", data=NoticeEvent.model_validate({"level": notice.level, "text": text}))
+def _job_event(services: Services, job: Job, identifier: str | None) -> ServerSentEvent:
+    return ServerSentEvent(event="job", id=identifier, raw_data=services.event_texts.of(job, JobOut.of))
 
 
 def _forgotten(number: int, job: str) -> ServerSentEvent:
@@ -336,7 +309,7 @@ def _replayed(services: Services, number: int, fields: dict[str, Any]) -> Server
         return _forgotten(number, fields["forgotten"])
     try:
         job = job_from_fields(fields)
-        return job_event(services, number, job) if job.kind in KINDS else None
+        return _job_event(services, job, str(number)) if job.kind in KINDS else None
     except (OsfError, TypeError):
         return None
 
@@ -346,14 +319,14 @@ def _scene_event(services: Services) -> ServerSentEvent:
     record = next((r for r in services.runner.scenes.all() if r.id == current), None)
     if record is None:
         return ServerSentEvent(event="scene", raw_data="null")
-    text = services.event_texts.of(record, partial(scene_out, services, record))
+    text = services.event_texts.of(record, partial(scene_out, services))
     return ServerSentEvent(event="scene", raw_data=text)
 
 
-def _draft_event(services: Services, changed: DraftChanged) -> ServerSentEvent:
-    if changed.draft is None:
+def _draft_event(services: Services, draft: Draft | None) -> ServerSentEvent:
+    if draft is None:
         return ServerSentEvent(event="draft", raw_data="null")
-    return ServerSentEvent(event="draft", data=DraftOut.of(changed.draft, services.objects.labels()))
+    return ServerSentEvent(event="draft", data=DraftOut.of(draft, services.objects.labels()))
 
 
 def _look(services: Services, look: Looking) -> LookEvent:

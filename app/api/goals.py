@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response
@@ -26,10 +25,10 @@ from app.api.bodies import (
 from app.api.dependencies import Services, ServicesDep, slow
 from app.api.models import DisplayName, Input, LightIn, Poses, SceneRef
 from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
-from app.api.problems import NotFound, named_in_path, problems
+from app.api.problems import named_in_path, problems
 from app.api.scenes import SceneObject
 from app.jobs.params import Identifier, ObjectCount, Seed
-from app.services.goals import Draft, GoalCheck, GoalVerdict, NoDraft
+from app.services.goals import Draft, GoalVerdict, NoDraft
 from app.storage.photos import PhotoCrop
 from app.storage.records import GoalRecord, Source
 from osfcore.errors import InvalidInput, OsfError
@@ -93,10 +92,6 @@ class CropIn(Input):
     width: float = Field(allow_inf_nan=False, description="Its height follows from the camera's proportions [px].")
     turn_deg: float = Field(0.0, allow_inf_nan=False, description="Clockwise about its centre.")
 
-    def crop(self) -> PhotoCrop:
-        """Unchecked."""
-        return PhotoCrop(self.left, self.top, self.width, self.turn_deg)
-
 
 class GoalPatch(Input):
     """Another part of the photo."""
@@ -132,11 +127,6 @@ class GoalCheckOut(BaseModel):
     text: str = Field(description="What is wrong and what to do; empty if nothing is.")
     scene: str | None = Field(description="The table that it was made for, if that is another one and still there.")
 
-    @staticmethod
-    def of(check: GoalCheck) -> GoalCheckOut:
-        """From the service's own."""
-        return GoalCheckOut(verdict=check.verdict, refused=check.is_refused, text=check.text, scene=check.scene)
-
 
 class GoalOut(BaseModel):
     """A goal image that is kept."""
@@ -167,7 +157,7 @@ class GoalOut(BaseModel):
             height=record.camera.height,
             camera=CameraJson.of(record.camera),
             objects=None if record.poses is None else [ObjectJson.of(*placed) for placed in record.poses],
-            photo=None if record.photo is None else PhotoOut.model_validate(asdict(record.photo)),
+            photo=None if record.photo is None else PhotoOut.model_validate(record.photo, from_attributes=True),
         )
 
 
@@ -235,7 +225,7 @@ async def create(
         record = await run_in_threadpool(services.goals.receive, data, name, seen_by)
     elif kind == JSON:
         body = parsed(GoalIn, await whole_body(request, SMALL_BODY_BYTES))
-        record = await services.lanes.slow.run(_made, services, body)
+        record = await services.slow_lane.run(_made, services, body)
     else:
         advice = "Send a photo, such as a JPEG or PNG file, or JSON that says how the objects lie."
         raise HTTPException(415, advice)
@@ -263,7 +253,7 @@ def draft(services: ServicesDep) -> DraftOut:
     """Tell what is being composed."""
     draft = services.goals.draft
     if draft is None:
-        raise NotFound(str(NoDraft()))
+        raise NoDraft
     return _draft_out(services, draft)
 
 
@@ -306,7 +296,7 @@ def get(record: FoundDep) -> GoalOut:
 @slow
 def crop(services: ServicesDep, record: FoundDep, body: GoalPatch) -> GoalOut:
     """Cut another part out of a goal's photo."""
-    return GoalOut.of(services.goals.crop(record.id, body.crop.crop()))
+    return GoalOut.of(services.goals.crop(record.id, PhotoCrop(**body.crop.model_dump())))
 
 
 @router.get("/{goal}/check", responses=problems(404, 409, 503))
@@ -317,7 +307,8 @@ def check(
     scene: Annotated[Identifier | None, Query(description="Identifier; by default the one shown.")] = None,
 ) -> GoalCheckOut:
     """Tell within seconds whether a goal shows the objects of a table; the first time this waits for models."""
-    return GoalCheckOut.of(services.goal_checks.check(record.id, scene))
+    found = services.goal_checks.check(record.id, scene)
+    return GoalCheckOut(verdict=found.verdict, refused=found.is_refused, text=found.text, scene=found.scene)
 
 
 @router.get("/{goal}/photo.jpg", response_class=Response, responses={**problems(404, 409), **JPEG})

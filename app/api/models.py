@@ -56,6 +56,12 @@ class Input(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
+class Excerpt(BaseModel):
+    """Part of a file or answer that holds more than is needed here; the rest is left alone."""
+
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+
 class LightIn(Input):
     """A distant light; only its direction counts."""
 

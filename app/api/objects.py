@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from typing import Annotated, Literal
 
-import numpy as np
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, Field
 
@@ -17,7 +16,6 @@ from app.api.paging import DamagedOut
 from app.api.problems import named_in_path, problems
 from app.jobs.params import ObjectName
 from osfcore.errors import OsfError
-from osfcore.objects.asset import ObjectInfo
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.objects.fetch import DEFAULT_NAMES, MAX_MASS_KG, NewObject
 
@@ -43,33 +41,6 @@ class ObjectOut(BaseModel):
     own: bool = Field(description="Whether it was added here, and can be deleted.")
     fetchable: bool = Field(description="Whether a job of the kind fetch_assets can bring it here.")
     version: str | None = Field(description="Changes with its looks and facts; null until it is on this machine.")
-
-    @staticmethod
-    def of(
-        info: ObjectInfo, size_m: np.ndarray | None, version: str | None, *, is_own: bool, is_fetchable: bool
-    ) -> ObjectOut:
-        """From catalogue facts.
-
-        Args:
-            info: the facts.
-            size_m: extents of the bounding box [m]; None if it is not on this machine.
-            version: what changes with it.
-            is_own: whether a user added it.
-            is_fetchable: whether the package index has it.
-        """
-        return ObjectOut(
-            name=info.name,
-            label=info.label,
-            mass_kg=info.mass_kg,
-            size_m=None if size_m is None else size_m.tolist(),
-            symmetry=SymmetryOut(kind=info.symmetry.kind, reason=info.symmetry.reason),
-            licence=info.licence,
-            attribution=info.attribution,
-            available=size_m is not None,
-            own=is_own,
-            fetchable=is_fetchable,
-            version=version,
-        )
 
 
 class ObjectList(BaseModel):
@@ -154,8 +125,19 @@ def _object(services: Services, name: str) -> ObjectOut:
     info = library.info(name)
     try:
         library.check(name)
-        size_m, version = library.size_m(name), library.digest(name)[:12]
+        size_m, version = library.size_m(name).tolist(), library.digest(name)[:12]
     except OsfError:  # not fetched, or damaged
         size_m, version = None, None
-    is_own = name not in CATALOGUE
-    return ObjectOut.of(info, size_m, version, is_own=is_own, is_fetchable=name in DEFAULT_NAMES)
+    return ObjectOut(
+        name=info.name,
+        label=info.label,
+        mass_kg=info.mass_kg,
+        size_m=size_m,
+        symmetry=SymmetryOut(kind=info.symmetry.kind, reason=info.symmetry.reason),
+        licence=info.licence,
+        attribution=info.attribution,
+        available=size_m is not None,
+        own=name not in CATALOGUE,
+        fetchable=name in DEFAULT_NAMES,
+        version=version,
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import Services, ServicesDep, slow
@@ -162,8 +162,6 @@ stories_router = APIRouter(prefix="/api/stories", tags=["stories"], responses=pr
 
 class StoryOut(BaseModel):
     """A recorded episode of an example."""
-
-    model_config = ConfigDict(extra="ignore")
 
     name: str = Field(description="Of the story, and of the example at /api/presets.")
     title: str

@@ -6,18 +6,17 @@ Send a photo, mark objects in it, let them be found, make it a table or a goal. 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Response
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat
 from starlette.concurrency import run_in_threadpool
 
 from app.api.bodies import JPEG, PNG, BoundedRoute, OpenFile, is_photo, kind_of, upload, whole_body
 from app.api.dependencies import Services, ServicesDep, slow
 from app.api.goals import GoalOut
 from app.api.jobs import JobOut
-from app.api.models import Box, DisplayName, Input, Pixel
+from app.api.models import Box, DisplayName, Excerpt, Input, Pixel
 from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
 from app.api.problems import named_in_path, problems
 from app.api.scenes import SceneOut, scene_out
@@ -28,22 +27,12 @@ from app.processes.messages.photo_messages import CameraSource, Mark, Points, St
 from app.storage.records import MarkedObject, TablePhoto
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.photo.board import Board, board_pdf
-from osfcore.photo.calibration import (
-    MOST_PHOTOS,
-    Calibration,
-    CalibrationJson,
-    Sighting,
-    board_place,
-    calibration_to_json,
-    known_camera,
-)
-from osfcore.photo.found_scene import FoundLight, FoundPose, FoundScene, TableSource
+from osfcore.photo.calibration import MOST_PHOTOS, CalibrationJson, board_place, calibration_to_json, known_camera
+from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, TableSource
 
 
-class CameraIn(BaseModel):
+class CameraIn(Excerpt):
     """A calibrated camera, as a calibration tells it; what it says of its accuracy does not matter."""
-
-    model_config = ConfigDict(extra="ignore", strict=True)
 
     name: DisplayName
     T_world_camera: list[list[FiniteFloat]] | None = None
@@ -62,13 +51,6 @@ class SightingOut(BaseModel):
     height: int = Field(description="[px]")
     corners: list[list[float]] = Field(description="Of the board's squares [px].")
 
-    @staticmethod
-    def of(identifier: str, seen: Sighting) -> SightingOut:
-        """From the core's own."""
-        width, height = seen.size
-        corners = seen.points_px.round(2).tolist()
-        return SightingOut(id=identifier, name=seen.name, width=width, height=height, corners=corners)
-
 
 _OnTable = Annotated[float, Field(ge=-TABLE_SIDE_M / 2, le=TABLE_SIDE_M / 2)]
 
@@ -78,7 +60,7 @@ class PlaceIn(Input):
 
     x_m: _OnTable = 0.0
     y_m: _OnTable = 0.0
-    turn_deg: float = Field(0.0, ge=-360, le=360, description="To the left, seen from above.")
+    turn_deg: float = Field(default=0.0, ge=-360, le=360, description="To the left, seen from above.")
 
 
 class CalibrateIn(Input):
@@ -86,7 +68,7 @@ class CalibrateIn(Input):
 
     photos: list[Identifier] = Field(max_length=MOST_PHOTOS)
     table: Identifier | None = Field(None, description="The board lying on the table; tells where the camera stands.")
-    place: PlaceIn = Field(default_factory=lambda: PlaceIn(x_m=0.0, y_m=0.0, turn_deg=0.0))
+    place: PlaceIn = Field(default_factory=PlaceIn)
     name: DisplayName = Field("camera", description="Of the camera.")
 
 
@@ -103,14 +85,6 @@ class CalibrationOut(BaseModel):
     missing: str = Field(description="Why they do not suffice, a sentence; empty where they do.")
     next: AdviceOut | None = Field(description="Null if nothing helps.")
     camera: CalibrationJson = Field(description="As `osf photo estimate --camera` takes it, if nothing is missing.")
-
-    @staticmethod
-    def of(found: Calibration, name: str) -> CalibrationOut:
-        """From the core's own."""
-        camera = CalibrationJson.model_validate(calibration_to_json(found, name))
-        advice = found.advice
-        following = None if advice is None else AdviceOut(words=advice.words, expected_error_mm=1e3 * advice.mean_m)
-        return CalibrationOut(missing=found.missing, next=following, camera=camera)
 
 
 PointIn = Annotated[list[Pixel], Field(min_length=2, max_length=2)]
@@ -206,16 +180,6 @@ class MarkedOut(BaseModel):
     choice: int | None = Field(description="The pose that a person took; null before that.")
     found: ObjectFound | None
 
-    @staticmethod
-    def of(marked: MarkedObject, label: str, found: ObjectFound | None) -> MarkedOut:
-        """From the service's own."""
-        mark = marked.mark
-        strokes = [StrokeIn(adds=s.adds, radius=s.radius, points=_lists(s.points)) for s in mark.strokes]
-        return MarkedOut(
-            name=marked.name, label=label, box=list(mark.box), on=_lists(mark.on), off=_lists(mark.off),
-            strokes=strokes, outline=[_lists(line) for line in marked.outline], choice=marked.choice, found=found,
-        )  # fmt: skip
-
 
 class PhotoFacts(BaseModel):
     """A photo of a table."""
@@ -241,24 +205,6 @@ class TablePhotoOut(PhotoFacts):
     doubts: list[str] = Field(description="Why nothing is made of it unless despite_doubts; empty where nothing is.")
     scene: str | None = Field(description="The table that it became.")
 
-    @staticmethod
-    def of(
-        photo: TablePhoto, job: Job | None, found: FoundScene | None, doubts: Sequence[str], labels: dict[str, str]
-    ) -> TablePhotoOut:
-        """From the service's own."""
-        each = {} if found is None or job is None else {o.name: _found(job, found, o.name) for o in found.objects}
-        marked = [MarkedOut.of(one, labels.get(one.name, one.name), each.get(one.name)) for one in photo.objects]
-        return TablePhotoOut(
-            **facts_of(photo).model_dump(),
-            notes=list(photo.notes) if found is None else found.notes,
-            objects=marked,
-            job=None if job is None else JobOut.of(job),
-            table=None if found is None else found.table,
-            light=None if found is None else found.light,
-            doubts=list(doubts),
-            scene=photo.scene,
-        )
-
 
 class PhotoList(PageOut):
     """Photos of tables, newest first."""
@@ -280,8 +226,7 @@ class GoalMadeOut(TableMadeOut):
     goal: GoalOut
 
 
-def facts_of(photo: TablePhoto) -> PhotoFacts:
-    """What a list says of a photo."""
+def _facts(photo: TablePhoto) -> PhotoFacts:
     return PhotoFacts(
         id=photo.id,
         name=photo.name,
@@ -294,18 +239,22 @@ def facts_of(photo: TablePhoto) -> PhotoFacts:
     )
 
 
-def _found(job: Job, found: FoundScene, name: str) -> ObjectFound:
-    one = next(each for each in found.objects if each.name == name)
-    files = [sheet_name(name, number) for number in range(len(one.poses()))]
-    poses = [
-        PoseFound(**pose.model_dump(include=set(FoundPose.model_fields)), picture=_path(job, file))
-        for pose, file in zip(one.poses(), files, strict=True)
-    ]
-    return ObjectFound(poses=poses, doubt=one.doubt)
+def _found(job: Job, found: FoundObject) -> ObjectFound:
+    poses = []
+    for number, pose in enumerate(found.poses()):
+        file = sheet_name(found.name, number)
+        picture = f"/api/jobs/{job.id}/files/{file}" if file in job.files else None
+        poses.append(PoseFound(**pose.model_dump(include=set(FoundPose.model_fields)), picture=picture))
+    return ObjectFound(poses=poses, doubt=found.doubt)
 
 
-def _path(job: Job, file: str) -> str | None:
-    return f"/api/jobs/{job.id}/files/{file}" if file in job.files else None
+def _marked(marked: MarkedObject, label: str, found: ObjectFound | None) -> MarkedOut:
+    mark = marked.mark
+    strokes = [StrokeIn(adds=s.adds, radius=s.radius, points=_lists(s.points)) for s in mark.strokes]
+    return MarkedOut(
+        name=marked.name, label=label, box=list(mark.box), on=_lists(mark.on), off=_lists(mark.off),
+        strokes=strokes, outline=[_lists(line) for line in marked.outline], choice=marked.choice, found=found,
+    )  # fmt: skip
 
 
 def _points(points: list[list[float]]) -> Points:
@@ -366,7 +315,7 @@ def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEnt
     """List photos of tables, newest first."""
     shown, total, following = page(services.photos.all(), limit, after, newest_first=True)
     damaged = DamagedOut.of(services.photos.damaged())
-    return PhotoList(photos=[facts_of(photo) for photo in shown], damaged=damaged, total=total, next=following)
+    return PhotoList(photos=[_facts(photo) for photo in shown], damaged=damaged, total=total, next=following)
 
 
 @router.get("/board.pdf", response_class=Response, responses={200: {"content": {"application/pdf": {}}}})
@@ -469,8 +418,18 @@ def drawing(services: ServicesDep, photo: PhotoDep) -> Response:
 def _out(services: Services, photo: TablePhoto) -> TablePhotoOut:
     job = services.photos.job(photo)
     found = services.photos.found(photo) if job is not None and job.state == "done" else None
-    doubts = () if found is None else services.photos.doubts(photo, found)
-    return TablePhotoOut.of(photo, job, found, doubts, services.objects.labels())
+    by_name = {} if job is None or found is None else {one.name: _found(job, one) for one in found.objects}
+    labels = services.objects.labels()
+    return TablePhotoOut(
+        **_facts(photo).model_dump(),
+        notes=list(photo.notes) if found is None else found.notes,
+        objects=[_marked(one, labels.get(one.name, one.name), by_name.get(one.name)) for one in photo.objects],
+        job=None if job is None else JobOut.of(job),
+        table=None if found is None else found.table,
+        light=None if found is None else found.light,
+        doubts=[] if found is None else list(services.photos.doubts(photo, found)),
+        scene=photo.scene,
+    )
 
 
 CALIBRATION_UPLOAD_PATH = "/api/calibration/photos"
@@ -485,7 +444,10 @@ async def sight(
 ) -> SightingOut:
     """Look for the printed board in a photo; the photo itself is not kept."""
     data = await _photo_body(request, services.settings.max_photo_bytes)
-    return SightingOut.of(*await run_in_threadpool(services.board_photos.add, data, name))
+    identifier, seen = await run_in_threadpool(services.board_photos.add, data, name)
+    width, height = seen.size
+    corners = seen.points_px.round(2).tolist()
+    return SightingOut(id=identifier, name=seen.name, width=width, height=height, corners=corners)
 
 
 @calibration_router.post("", responses=problems(503))
@@ -493,4 +455,8 @@ async def sight(
 def assess(services: ServicesDep, body: CalibrateIn) -> CalibrationOut:
     """Tell what photos of the board tell of the camera so far, what is missing and what helps most."""
     place = board_place(body.place.x_m, body.place.y_m, body.place.turn_deg)
-    return CalibrationOut.of(services.board_photos.assess(body.photos, body.table, place), body.name)
+    found = services.board_photos.assess(body.photos, body.table, place)
+    camera = CalibrationJson.model_validate(calibration_to_json(found, body.name))
+    advice = found.advice
+    following = None if advice is None else AdviceOut(words=advice.words, expected_error_mm=1e3 * advice.mean_m)
+    return CalibrationOut(missing=found.missing, next=following, camera=camera)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import json
 from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Response
-from pydantic import BaseModel, ConfigDict, FailFast, Field
+from pydantic import BaseModel, FailFast, Field
 
 from app.api.bodies import BoundedRoute
 from app.api.dependencies import ServicesDep
-from app.api.models import Input, LightIn, Position, Quaternion, Vector3, Velocity
+from app.api.models import Excerpt, Input, Position, Quaternion, Vector3, Velocity
 from app.api.problems import problems
 from app.jobs.params import ObjectName
 from app.processes.messages.neural_messages import Predicted
@@ -33,12 +32,6 @@ _STATE_EXAMPLE = {
     "light": {"position": [0.3, -0.4, 0.8]},
     "pusher": {"position": [-0.12, 0.0, 0.062]},
 }
-
-
-class Excerpt(BaseModel):
-    """Part of a file or answer that holds more than is needed here; the rest is left alone."""
-
-    model_config = ConfigDict(extra="ignore", strict=True)
 
 
 class PlacedObject(Excerpt):
@@ -68,7 +61,7 @@ class StateIn(Excerpt):
             np.array([placed.position for placed in self.objects], float),
             np.array([placed.quaternion for placed in self.objects], float),
         )
-        light = Light(np.array(_OVERHEAD)) if self.light is None else LightIn(position=self.light.position).light()
+        light = Light(np.array(_OVERHEAD if self.light is None else self.light.position))
         pusher = None if self.pusher is None else np.array(self.pusher.position)
         return SceneState(tuple(placed.name for placed in self.objects), poses, light, pusher)
 
@@ -125,15 +118,19 @@ async def predict(services: ServicesDep, body: PredictionIn) -> Response:
         raise InvalidInput("state", "missing", "given together with what was before")
     if before is not None and body.method == "paper":
         raise InvalidInput("before", "given", "left out with the method as published, which has no velocities")
-    record, state = (services.predictions.current(), None) if body.state is None else (None, body.state.state())
-    if state is None:
-        assert record is not None
+    if body.state is None:
+        record = services.predictions.current()
         state = record.state
     else:
-        _check_known(state, services.fields.names())
+        record, state = None, body.state.state()
+        known = services.fields.names()
+        for name in state.names:
+            if name not in known:  # 422; one that is on the table without a field is a matter of the present state, 409
+                raise UnknownName("object with a field", name, known)
     actions = await asyncio.to_thread(_actions, body, len(state.names))
-    order = functools.partial(services.predictions.submit, state, actions, before=before, method=body.method)
-    answer = await asyncio.wrap_future(await asyncio.to_thread(order))
+    submit = services.predictions.submit
+    future = await asyncio.to_thread(submit, state, actions, before=before, method=body.method)
+    answer = await asyncio.wrap_future(future)
     assert isinstance(answer, Predicted)  # nothing overtakes an order with a key of its own
     content = await asyncio.to_thread(_json, answer, record)
     return Response(content, media_type="application/json")
@@ -148,13 +145,6 @@ def _actions(body: PredictionIn, objects: int) -> np.ndarray:
     if poses > MAX_POSES:
         raise InvalidInput("number of poses in the answer, K x (T+1) x N,", poses, f"at most {MAX_POSES}")
     return actions
-
-
-def _check_known(state: SceneState, known: tuple[str, ...]) -> None:
-    """What is sent names objects as it likes; what is on the table is a matter of the present state (409)."""
-    for name in state.names:
-        if name not in known:
-            raise UnknownName("object with a field", name, known)
 
 
 def _json(answer: Predicted, record: SceneRecord | None) -> bytes:

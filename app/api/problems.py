@@ -60,6 +60,7 @@ from osfcore.photo.table_layout import NoPhotographedTable
 from osfcore.plugins import BrokenPlugin
 
 _log = logging.getLogger(__name__)
+_MEDIA_TYPE = "application/problem+json"
 
 
 class ProblemPointer(BaseModel):
@@ -135,15 +136,9 @@ def named_in_path() -> Iterator[None]:
         raise NotFound(str(error)) from None
 
 
-class ProblemResponse(JSONResponse):
-    """A JSON response of the problem media type."""
-
-    media_type = "application/problem+json"
-
-
 def problem(
     status: int, detail: str, pointers: list[ProblemPointer] | None = None, headers: dict[str, str] | None = None
-) -> ProblemResponse:
+) -> JSONResponse:
     """A response of the problem media type.
 
     Args:
@@ -156,7 +151,7 @@ def problem(
     clean = detail.encode("utf-8", "replace").decode("utf-8")
     title = _WORDS[status][0] if status in _WORDS else "Error"
     body = Problem(title=title, status=status, detail=clean, errors=pointers)
-    return ProblemResponse(body.model_dump(exclude_none=True), status, headers)
+    return JSONResponse(body.model_dump(exclude_none=True), status, headers, _MEDIA_TYPE)
 
 
 def too_large(most_bytes: int) -> str:
@@ -182,7 +177,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _on_defect)
 
 
-async def _on_osf_error(request: Request, error: Exception) -> ProblemResponse:
+async def _on_osf_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, OsfError)
     status = status_of(error)
     detail = without_places(str(error), request.app.state.settings.data_dir)
@@ -210,7 +205,7 @@ def _methods(request: Request) -> list[str]:
     return sorted(methods | ({"HEAD"} if "GET" in methods else set()))
 
 
-async def _on_validation_error(_: Request, error: Exception) -> ProblemResponse:
+async def _on_validation_error(_: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     entries = error.errors()
     pointers = [_pointer(entry, error.body) for entry in entries[:_MOST_POINTERS]]
@@ -219,11 +214,11 @@ async def _on_validation_error(_: Request, error: Exception) -> ProblemResponse:
     return problem(422, sentence + (more if len(entries) > 1 else ""), pointers)
 
 
-async def _on_broken_upload(_: Request, __: Exception) -> ProblemResponse:
+async def _on_broken_upload(_: Request, __: Exception) -> JSONResponse:
     return problem(400, "The upload broke off.")
 
 
-async def _on_defect(request: Request, error: Exception) -> ProblemResponse:
+async def _on_defect(request: Request, error: Exception) -> JSONResponse:
     _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     return problem(500, f"The service failed on this request ({type(error).__name__}); its log tells more.")
 
@@ -259,7 +254,7 @@ def _sentence(entry: Mapping[str, Any]) -> str:
     subject = "The request" if name in ("body", "query") else name.capitalize()
     must = _MUST.get(entry["type"])
     if must is None:
-        return f"{subject} cannot be used: {str(entry['msg']).encode('utf-8', 'replace').decode('utf-8')}."
+        return f"{subject} cannot be used: {entry['msg']}."
     value = entry.get("input")
     is_shown = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGEST_SHOWN
     now = f" is {value:g}, but it" if is_shown and must.startswith("must") else ""
@@ -280,7 +275,7 @@ def _pointer(entry: dict[str, Any], body: object) -> ProblemPointer:
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """OpenAPI entries for the errors that a route answers, besides those that any route does."""
-    content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    content = {_MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"content": content, "description": _WORDS[status][1]}
         for status in (400, 401, 403, 413, 421, 422, *statuses)

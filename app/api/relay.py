@@ -30,8 +30,6 @@ router = APIRouter(include_in_schema=False)
 _PASSED_CLOSE_CODES = (1000, 1001, 1002, 1011, 1012)
 _INTERNAL_ERROR = 1011
 _OPEN_TIMEOUT_S = 5.0
-
-
 _LOOKS = ("hideViserLogo", "darkMode")  # what the page asks of viser's client
 _SCRIPTS = ("viewer-without-eval.js", "software-renderer.js")
 _VIEWER = re.compile(rf"/viewer(/{VISITOR})?/?")
@@ -76,26 +74,27 @@ def _is_own(name: str, address: str, request: Request, services: Services) -> bo
 @router.websocket("/viewer")
 async def relay(browser: WebSocket, services: ServicesDep) -> None:
     """Pass frames both ways between a browser and the viewer on loopback."""
-    await _relay(browser, services, {})
+    await _relay(browser, services, None)
 
 
 @router.websocket("/viewer/{visitor}")
 async def relay_of_page(browser: WebSocket, services: ServicesDep, visitor: Visitor) -> None:
     """Likewise, telling the viewer in which page the browser shows it."""
-    await _relay(browser, services, {PAGE_HEADER: visitor}, visitor)
+    await _relay(browser, services, visitor)
 
 
-async def _relay(browser: WebSocket, services: Services, headers: dict[str, str], visitor: str | None = None) -> None:
+async def _relay(browser: WebSocket, services: Services, visitor: str | None) -> None:
     if not is_same_origin(browser, services.settings.allowed_origins):
         await browser.close(code=1008)  # before accepting: the browser sees 403
         return
     offered = [Subprotocol(name) for name in browser.scope.get("subprotocols", [])]
+    page = {} if visitor is None else {PAGE_HEADER: visitor}
     try:
         # Compressing again, size limits, proxies and pings between two ends of one machine would only cost or break.
         upstream = await connect(
             f"ws://127.0.0.1:{services.viewer.port}",
             subprotocols=offered or None,
-            additional_headers={SECRET_HEADER: services.viewer.server.secret, **headers},
+            additional_headers={SECRET_HEADER: services.viewer.server.secret, **page},
             compression=None,
             max_size=None,
             proxy=None,

@@ -17,7 +17,7 @@ from app.episodes.settings import ChosenSettings
 from app.jobs.params import Identifier, Seed
 from app.services.robot import AskedDrive, CameraNow, RobotNow, State
 from app.storage.database import utc_of
-from osfcore.io.scene_file import CameraJson, camera_to_json
+from osfcore.io.scene_file import CameraJson
 
 
 class RobotSettingsIn(Input):
@@ -105,7 +105,7 @@ class RobotOut(BaseModel):
             state=now.state,
             text=now.text,
             limits=None if limits is None else RobotLimitsOut.model_validate(limits, from_attributes=True),
-            cameras=[] if about is None else [CameraJson.model_validate(camera_to_json(c)) for c in about.cameras],
+            cameras=[] if about is None else [CameraJson.of(camera) for camera in about.cameras],
             masks=[] if about is None else sorted(about.masks),
             deadman_s=None if about is None else about.deadman_s,
             episode=None if now.episode is None else JobOut.of(now.episode),

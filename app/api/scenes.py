@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from dataclasses import replace
 from functools import cache
 from typing import Annotated, Literal
 
@@ -23,7 +24,7 @@ from app.services.fields import MissingFields
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.cameras import CAMERA_POSITIONS, DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
 from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import MAX_OBJECTS, SceneState
+from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.scene_file import CameraJson, ObjectJson, PointJson
 
 
@@ -259,12 +260,15 @@ async def mask(
 
 
 async def _png(services: Services, command: TakeImage | TakeMask) -> Response:
+    return Response(await _taken(services, command), media_type="image/png", headers={"Cache-Control": "no-cache"})
+
+
+async def _taken(services: Services, command: TakeImage | TakeMask) -> bytes:
     try:
-        png = await services.runner.scenes.image(command)
+        return await services.runner.scenes.image(command)
     except OsfError:
         record_of(services, command.id)  # a scene that was deleted meanwhile is not found, whatever the simulation says
         raise
-    return Response(png, media_type="image/png", headers={"Cache-Control": "no-cache"})
 
 
 def scene_out(services: Services, record: SceneRecord) -> SceneOut:
@@ -300,10 +304,6 @@ _PSNR: dict[str, object] = {
     "schema": {"type": "number"},
 }
 COMPARED: dict[int | str, dict[str, object]] = {200: {**PNG[200], "headers": {PSNR_HEADER: _PSNR}}}
-Compared = Annotated[
-    Literal["rendered", "difference", "comparison"],
-    Query(description="The difference is absolute, times 4; a comparison is camera image, rendering, difference."),
-]
 neural_router = APIRouter(prefix="/api/scenes", tags=["neural"], responses=problems(503))
 
 
@@ -314,7 +314,10 @@ async def neural_image(
     services: ServicesDep,
     scene: SceneId,
     camera: CameraName,
-    kind: Compared = "rendered",
+    kind: Annotated[
+        Literal["rendered", "difference", "comparison"],
+        Query(description="The difference is absolute, times 4; a comparison is camera image, rendering, difference."),
+    ] = "rendered",
     size: SizeQuery = None,
     pusher: Annotated[bool, Query(description="Whether the pusher and its shadow are in the image.")] = True,
 ) -> Response:
@@ -323,27 +326,21 @@ async def neural_image(
     The first time, this waits for the renderer to load.
     """
     side = size or view_of(services, scene, camera).image_size
-    comparison = await _compare(services, TakeImage(scene, camera, side, pusher=pusher))
-    return compared_png(comparison, kind)
+    record, observed = await _observe(services, TakeImage(scene, camera, side, pusher=pusher))
+    state, known = record.state, services.fields.names()
+    missing = [name for name in state.names if name not in known]
+    if missing:
+        raise MissingFields(missing)
+    if not pusher:
+        state = replace(state, pusher=None)
+    order = CompareView(uuid.uuid4().hex, state, scene_camera(camera, side), observed)
+    return compared_png(await compared(services, order), kind)
 
 
 def compared_png(comparison: Comparison, kind: str) -> Response:
     """One picture of a comparison, with its PSNR in the header."""
     headers = {"Cache-Control": "no-cache", PSNR_HEADER: f"{comparison.psnr_db:.2f}"}
     return Response(getattr(comparison, kind), media_type="image/png", headers=headers)
-
-
-async def _compare(services: Services, command: TakeImage) -> Comparison:
-    record, observed = await _observe(services, command)
-    state = record.state
-    known = services.fields.names()
-    missing = [name for name in state.names if name not in known]
-    if missing:
-        raise MissingFields(missing)
-    if not command.pusher:
-        state = SceneState(state.names, state.poses, state.light, None)
-    order = CompareView(uuid.uuid4().hex, state, scene_camera(command.camera, command.size), observed)
-    return await compared(services, order)
 
 
 async def compared(services: Services, order: CompareView) -> Comparison:
@@ -360,11 +357,7 @@ async def compared(services: Services, order: CompareView) -> Comparison:
 async def _observe(services: Services, command: TakeImage, tries: int = 3) -> tuple[SceneRecord, bytes]:
     """A camera's image, and the scene as it was then; while things keep moving, one that is close."""
     record = view_of(services, command.id, command.camera)
-    try:
-        observed = await services.runner.scenes.image(command)
-    except OsfError:
-        view_of(services, command.id, command.camera)  # a scene that was deleted meanwhile is not found
-        raise
+    observed = await _taken(services, command)
     if tries > 1 and record.revision != view_of(services, command.id, command.camera).revision:
         return await _observe(services, command, tries - 1)
     return record, observed

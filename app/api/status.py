@@ -28,19 +28,6 @@ from app.services.runner import Runner
 LEAST_FREE_BYTES = 50 << 20  # on the disk of the data directory; with less, the next episode may not fit
 
 
-def faults(runner: Runner, data_dir: pathlib.Path) -> tuple[str, ...]:
-    """What keeps scenes, jobs or storing from working.
-
-    Args:
-        runner: holds the simulation and the jobs.
-        data_dir: where everything is stored.
-    """
-    found = [runner.jobs.problem, _disk_problem(data_dir), runner.storage.problem, runner.storing_problem()]
-    if runner.scenes.status == "restarting":
-        found.append("The simulation has stopped and is being restarted.")
-    return tuple(sentence for sentence in found if sentence is not None)
-
-
 def _disk_problem(data_dir: pathlib.Path) -> str | None:
     try:
         if os.statvfs(data_dir).f_flag & os.ST_RDONLY:
@@ -56,6 +43,7 @@ def _disk_problem(data_dir: pathlib.Path) -> str | None:
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
 _UNMEASURED = ("/events", "/viewer")  # they last as long as their page
+_METHODS = ("GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS")
 
 
 class Metrics:
@@ -139,12 +127,8 @@ class MetricsMiddleware:
         try:
             await self._app(scope, receive, noting)
         finally:
-            self._metrics.answered(_known(scope["method"]), status, time.perf_counter() - began)
-
-
-def _known(method: str) -> str:
-    """Anybody may invent methods; each would be kept for ever."""
-    return method if method in ("GET", "HEAD", "POST", "PATCH", "PUT", "DELETE", "OPTIONS") else "other"
+            method = scope["method"] if scope["method"] in _METHODS else "other"  # anybody may invent some
+            self._metrics.answered(method, status, time.perf_counter() - began)
 
 
 class Health(BaseModel):
@@ -198,14 +182,18 @@ _TEXT: dict[int | str, dict[str, Any]] = {
 @urgent
 def health(services: ServicesDep) -> Health:
     """Tell that the service runs, and what is wrong with it."""
-    found = list(faults(services.runner, services.settings.data_dir))
+    runner, disk = services.runner, _disk_problem(services.settings.data_dir)
+    stage = runner.scenes.status
+    simulation = "The simulation has stopped and is being restarted." if stage == "restarting" else None
+    found = (runner.jobs.problem, disk, runner.storage.problem, runner.storing_problem(), simulation)
+    wrong = [sentence for sentence in found if sentence is not None]
     return Health(
-        status="degraded" if found else "ok",
-        problems=found,
+        status="degraded" if wrong else "ok",
+        problems=wrong,
         version=VERSION,
-        uptime_s=round(services.runner.uptime_s, 3),
+        uptime_s=round(runner.uptime_s, 3),
         objects_available=len(services.objects.names()),
-        stage=services.runner.scenes.status,
+        stage=stage,
     )
 
 

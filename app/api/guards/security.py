@@ -32,23 +32,15 @@ _DOCS_POLICY = (
 )
 
 
-def host_name(host: str) -> str:
-    """The name in a Host header, without port."""
-    return (urlsplit(f"//{host}").hostname or "") if host else ""
-
-
 def is_known_host(host: str, allowed: Iterable[str]) -> bool:
     """Whether a Host header names this service: localhost, an allowed name, or any plain address.
 
     A plain address cannot be rebound: whoever can send it reaches this machine anyway.
     """
     try:
-        name = host_name(host)
-    except ValueError:
-        return False
-    if name == "localhost" or name.endswith(".localhost") or "*" in allowed or name in {a.lower() for a in allowed}:
-        return True
-    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        if name == "localhost" or name.endswith(".localhost") or "*" in allowed or name in {a.lower() for a in allowed}:
+            return True
         ipaddress.ip_address(name)
     except ValueError:
         return False
@@ -67,7 +59,10 @@ def is_same_origin(connection: HTTPConnection, allowed: Iterable[str] = ()) -> b
 
 
 class BodyLimitMiddleware:
-    """Refuses requests larger than what `limit_of` returns for their path [bytes]."""
+    """Refuses requests larger than what `limit_of` returns for their path [bytes].
+
+    Starlette's limit answers in plain text, before any handler of the app is asked; here that becomes a problem.
+    """
 
     def __init__(self, app: ASGIApp, *, limit_of: Callable[[str], int]) -> None:
         self._app = app
@@ -76,21 +71,23 @@ class BodyLimitMiddleware:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass on one request, counting what comes in."""
         limit = self._limit_of(scope.get("path", ""))
-        await RequestBodyLimitMiddleware(self._app, max_body_size=limit)(scope, receive, send)
+        is_refused = False
+
+        async def send_problem(message: Message) -> None:
+            nonlocal is_refused
+            if message["type"] == "http.response.start" and message["status"] == 413:
+                is_refused = True
+                await problem(413, too_large(limit))(scope, receive, send)
+            elif not is_refused:
+                await send(message)
+
+        await RequestBodyLimitMiddleware(self._app, max_body_size=limit)(scope, receive, send_problem)
 
 
 class SecurityMiddleware:
     """Refuses unknown hosts and foreign origins, and adds headers to every response."""
 
-    def __init__(
-        self,
-        app: ASGIApp,
-        *,
-        allowed_hosts: Iterable[str],
-        allowed_origins: Iterable[str],
-        limit_of: Callable[[str], int],
-    ) -> None:
-        self._limit_of = limit_of
+    def __init__(self, app: ASGIApp, *, allowed_hosts: Iterable[str], allowed_origins: Iterable[str]) -> None:
         self._app = app
         self._allowed_hosts = frozenset(allowed_hosts)
         self._allowed_origins = frozenset(allowed_origins)
@@ -108,24 +105,11 @@ class SecurityMiddleware:
                 await send({"type": "websocket.close", "code": 1008})
             return
         path = scope["path"]
-        is_too_large = False
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 _add_headers(MutableHeaders(scope=message), path)
             await send(message)
-
-        async def send_problems(message: Message) -> None:
-            # The body limit answers in plain text, before any handler of the app is asked.
-            nonlocal is_too_large
-            if is_too_large:
-                return
-            if message["type"] == "http.response.start" and message["status"] == 413:
-                is_too_large = True
-                detail = too_large(self._limit_of(path))
-                await problem(413, detail)(scope, receive, send_with_headers)
-                return
-            await send_with_headers(message)
 
         if not is_known:
             detail = "The service is not known under this host name; set OSF_ALLOWED_HOSTS to allow it."
@@ -134,7 +118,7 @@ class SecurityMiddleware:
             detail = "Requests from other sites are refused; set OSF_ALLOWED_ORIGINS to allow one."
             await problem(403, detail)(scope, receive, send_with_headers)
         else:
-            await self._app(scope, receive, send_problems)
+            await self._app(scope, receive, send_with_headers)
 
 
 def _add_headers(headers: MutableHeaders, path: str) -> None:
@@ -149,5 +133,4 @@ def _add_headers(headers: MutableHeaders, path: str) -> None:
     headers["Referrer-Policy"] = "same-origin"
     headers["Cross-Origin-Opener-Policy"] = "same-origin"
     headers["Cross-Origin-Resource-Policy"] = "same-origin"
-    if "cache-control" not in headers:  # pages and scripts of an updated service must not be mixed with old ones
-        headers["Cache-Control"] = "no-cache"
+    headers.setdefault("Cache-Control", "no-cache")  # pages and scripts of an updated service go together

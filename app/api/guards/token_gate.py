@@ -112,11 +112,11 @@ class TokenMiddleware:
         if self._is_session(connection.cookies.get(COOKIE, "")) and login is None:
             await self._app(scope, receive, send)
         elif given is not None and self._wrong_from(scope).are_too_many(given):
-            await _refuse(429, _TOO_MANY, {"Retry-After": "5"})(scope, receive, send)
+            await _refuse(scope, receive, send, 429, _TOO_MANY, {"Retry-After": "5"})
         elif given is None or not hmac.compare_digest(given, self._token):
             if given is not None:
                 self._wrong_from(scope).take(given)
-            await _refuse(401, _REFUSED, {"WWW-Authenticate": "Bearer"})(scope, receive, send)
+            await _refuse(scope, receive, send, 401, _REFUSED, {"WWW-Authenticate": "Bearer"})
         elif login is None:
             await self._app(scope, receive, send)
         else:
@@ -148,14 +148,13 @@ class TokenMiddleware:
         return answer
 
 
-def _refuse(status: int, sentence: str, headers: dict[str, str]) -> ASGIApp:
-    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008})
-        else:
-            await problem(status, sentence, headers=headers)(scope, receive, send)
-
-    return answer
+async def _refuse(
+    scope: Scope, receive: Receive, send: Send, status: int, sentence: str, headers: dict[str, str]
+) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008})
+    else:
+        await problem(status, sentence, headers=headers)(scope, receive, send)
 
 
 def _in_header(connection: HTTPConnection) -> bytes | None:

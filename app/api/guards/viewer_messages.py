@@ -7,7 +7,7 @@ the relay reads each frame (msgpack: a map with "type") and passes on the few ki
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from typing import Any
 
 import msgspec
@@ -15,17 +15,16 @@ import msgspec
 MAX_FRAME_BYTES = 1 << 14
 RATE, BURST = 200.0, 600.0  # messages a second; a camera that is dragged sends one a frame
 _MOST_TEXT = 200
-_CAMERA = frozenset({
-    "type", "wxyz", "position", "fov", "near", "far", "image_height", "image_width", "look_at", "up_direction",
-})  # fmt: skip
 CAMERA, DROP = "ViewerCameraMessage", "TransformControlsDragEndMessage"
-_FIELDS: Mapping[str, frozenset[str]] = {
-    CAMERA: _CAMERA,
-    "GuiUpdateMessage": frozenset({"type", "uuid", "updates"}),
-    "TransformControlsUpdateMessage": frozenset({"type", "name", "wxyz", "position", "owner"}),
-    "TransformControlsDragStartMessage": frozenset({"type", "name", "owner"}),
-    DROP: frozenset({"type", "name", "owner"}),
-}
+_FIELDS: Mapping[str, Set[str]] = {
+    CAMERA: {
+        "type", "wxyz", "position", "fov", "near", "far", "image_height", "image_width", "look_at", "up_direction",
+    },
+    "GuiUpdateMessage": {"type", "uuid", "updates"},
+    "TransformControlsUpdateMessage": {"type", "name", "wxyz", "position", "owner"},
+    "TransformControlsDragStartMessage": {"type", "name", "owner"},
+    DROP: {"type", "name", "owner"},
+}  # fmt: skip
 
 
 def allowed_kind(frame: bytes) -> str | None:
