@@ -108,6 +108,7 @@ class Panel(ABC):
 
     def __init__(self, name: str, interval_s: float = 0.0) -> None:
         self._thread = DrawingThread(name, self._draw, interval_s)
+        self._current: str | None = None  # the scene on view
 
     @property
     def is_idle(self) -> bool:
@@ -122,6 +123,8 @@ class Panel(ABC):
     def show(self, event: object) -> None:
         """Draw what an event says, soon; events of other kinds are ignored. Any thread may call."""
         with self._thread.changed:
+            if isinstance(event, CurrentScene):
+                self._current = None if event.record is None else event.record.id
             if self._store(event):
                 self._thread.wake()
 
@@ -192,14 +195,11 @@ class Playback:
                 case CurrentScene(record):
                     self._noted = None if record is None else record.id
                     self._generation += 1
-                case SceneChanged(record, states, interval_s):
-                    if record.id != self._noted:
-                        return
+                case SceneChanged(record, states, interval_s) if record.id == self._noted:
                     self._generation += not states
                     self._waiting_s += interval_s * len(states)
-                case FramesTaken(scene):
-                    if scene != self._noted:
-                        return
+                case FramesTaken(scene) if scene == self._noted:
+                    pass
                 case _:
                     return
             self._queue.put((event, self._generation))

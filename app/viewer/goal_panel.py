@@ -17,7 +17,7 @@ from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged, Goals
 from app.viewer.drawing import Panel, RunCommand
 from app.viewer.nodes.episode_nodes import GOAL, add_copy
-from app.viewer.nodes.room import NO_TURN, atomic, put
+from app.viewer.nodes.room import NO_TURN, Colour, atomic, put
 from app.viewer.nodes.scene_nodes import Client
 from osfcore.geometry.poses import Pose, quaternion_multiply
 from osfcore.objects.asset_library import AssetLibrary
@@ -54,21 +54,15 @@ class GoalPanel(Panel):
         self._commands = commands
         self._run_command = run_command
         self._draft = goals.draft
-        self._current: str | None = None
         self._copies: dict[str, _Copy] = {}
         self._words = server.scene.add_label(
             "/goal/problem", "", position=_WORDS_AT, visible=False, font_screen_scale=1.0, anchor="bottom-center"
         )
 
     def _store(self, event: object) -> bool:
-        match event:
-            case DraftChanged(draft):
-                self._draft = draft
-            case CurrentScene(record):
-                self._current = None if record is None else record.id
-            case _:
-                return False
-        return True
+        if isinstance(event, DraftChanged):
+            self._draft = event.draft
+        return isinstance(event, DraftChanged | CurrentScene)
 
     @property
     def is_composing(self) -> bool:
@@ -81,16 +75,14 @@ class GoalPanel(Panel):
     def _draw(self) -> None:
         with self._thread.changed:
             draft = self._draft if self.is_composing else None
-        poses = {} if draft is None else dict(draft.poses)
-        problem = "" if draft is None else draft.problem
+        poses, problem = ({}, "") if draft is None else (dict(draft.poses), draft.problem)
         with atomic(self._server):
             for name in set(self._copies) - set(poses):
                 self._copies.pop(name).remove()
             for name, pose in poses.items():
                 if name not in self._copies:
                     self._copies[name] = _Copy(self._server.scene, self._library, name, self._let_go)
-                self._copies[name].place(pose)
-                self._copies[name].colour(WRONG if problem else GOAL)
+                self._copies[name].place(pose, WRONG if problem else GOAL)
             self._words.text, self._words.visible = self._library.in_words(problem), bool(problem)
 
     def _let_go(self, copy: _Copy, grip: int, pose: Pose, client: Client) -> None:
@@ -146,16 +138,12 @@ class _Copy:
         """The draft has taken over what a hand did, unless a hand is at it again."""
         self._is_held = self._is_held and grip != self._grip
 
-    def place(self, pose: Pose) -> None:
-        """Put it where the draft has it, unless somebody holds it."""
-        if self._is_held:
-            return
-        self._laid = pose
-        put(self._gizmo, pose.position, NO_TURN)
-        put(self._shape, np.zeros(3), pose.quaternion)
-
-    def colour(self, colour: tuple[int, int, int]) -> None:
-        """Give it a colour."""
+    def place(self, pose: Pose, colour: Colour) -> None:
+        """Give it a colour, and put it where the draft has it, unless somebody holds it."""
+        if not self._is_held:
+            self._laid = pose
+            put(self._gizmo, pose.position, NO_TURN)
+            put(self._shape, np.zeros(3), pose.quaternion)
         self._shape.color = colour
 
     def remove(self) -> None:

@@ -82,15 +82,13 @@ class EstimatePanel(Panel):
         self._nodes = nodes
         self._job: Job | None = None
         self._step: EstimateStep | None = None  # not drawn yet
-        self._current: str | None = None
         self._drawn_job: str | None = None
         gui = server.gui
         with gui.add_folder("Estimate", expand_by_default=False):
-            self._wants_tried = gui.add_checkbox("Show candidates", True, hint="Poses and lights that are tried.")
+            wants_tried = gui.add_checkbox("Show candidates", True, hint="Poses and lights that are tried.")
             self._true_light = _TrueLight(gui, table, estimates.KIND, lambda: not nodes.is_empty)
-            clear = gui.add_button("Clear", hint="Remove what an estimate has drawn.")
-        self._wants_tried.on_update(lambda event: nodes.show_candidates(event.target.value))
-        clear.on_click(lambda _: self.forget())
+            gui.add_button("Clear", hint="Remove what an estimate has drawn.").on_click(lambda _: self.forget())
+        wants_tried.on_update(lambda event: nodes.show_candidates(event.target.value))
 
     def forget(self) -> None:
         """Remove what a finished estimate has drawn. Any thread may call."""
@@ -104,8 +102,7 @@ class EstimatePanel(Panel):
                 self._job, self._step = job, step
             case JobChanged(_, job) if job.kind == estimates.KIND and self._is_here(job) and takes_view(job, self._job):
                 self._job = job
-            case CurrentScene(record):
-                self._current = None if record is None else record.id
+            case CurrentScene():
                 if self._job is not None and not self._is_here(self._job):
                     self._job, self._step = None, None
             case _:
@@ -124,7 +121,6 @@ class EstimatePanel(Panel):
             self._drawn_job = None if job is None else job.id
         if step is not None:
             self._nodes.show(step.state, step.candidates, step.lights, step.estimate)
-            self._nodes.show_candidates(self._wants_tried.value)
         self._true_light.draw()
 
 
@@ -195,7 +191,6 @@ class EpisodePanel(Panel):
         self._nodes = nodes
         self._make_room = make_room
         self._state = _EpisodeState()
-        self._current: str | None = None
         self._drawn = _EpisodeState()
         self._plan_at = 0.0
         gui = server.gui
@@ -204,7 +199,7 @@ class EpisodePanel(Panel):
                 gui.add_checkbox(label, True, hint=hint).on_update(partial(self._show_part, part))
             self._true_light = _TrueLight(gui, table, episodes.KIND, lambda: nodes.shows_light)
             clear = gui.add_button("Clear", hint="Remove what a finished episode has drawn.")
-        clear.on_click(lambda _: self._forget())
+            clear.on_click(lambda _: self._forget())
 
     def _show_part(self, part: Part, event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
         self._nodes.show_part(part, event.target.value)
@@ -222,8 +217,7 @@ class EpisodePanel(Panel):
                 self._state = state.with_job(job).with_event(view)
             case JobChanged(_, job) if job.kind == episodes.KIND and takes_view(job, state.job):
                 self._state = state.with_job(job)
-            case CurrentScene(record):
-                self._current = None if record is None else record.id
+            case CurrentScene():
                 if not state.is_live and not state.is_on(self._current):
                     self._state = _EpisodeState()
             case DraftChanged(draft) if draft is not None and not state.is_live:

@@ -24,7 +24,7 @@ WARM_UP = "The renderer is loading, which can take half a minute the first time;
 _LATE_S = 1.0
 _NOTHING_M = 100.0  # depth where a ray meets nothing
 _BEHIND_M = 0.003  # pictures lie that much farther away, so that what stands on the table is not half in it
-_JPEG_QUALITY = {False: 75, True: 92}  # by whether a picture is sharp
+_QUICK_JPEG_QUALITY, _SHARP_JPEG_QUALITY = 75, 92
 _NEURAL = "neural pictures"
 _log = logging.getLogger(__name__)
 Seen = Callable[[], tuple[SceneState, str]]
@@ -62,8 +62,7 @@ class HiddenNodes:
             self._covers[path] = self._scene.add_frame(path, show_axes=False, visible=False)
         elif node is not self._covers.get(path):
             self._covers[path] = None
-            if node.visible:
-                node.visible = False
+            node.visible = False
 
     def _uncover(self, path: str) -> None:
         cover, node = self._covers.pop(path), self._scene.get_handle_by_name(path)
@@ -201,10 +200,10 @@ class ClientView:
             names: of the objects in it.
             root: of the nodes that it stands for.
         """
-        depth, is_sharp = picture.depth, picture.depth is not None
+        depth, quality = picture.depth, _QUICK_JPEG_QUALITY
         if depth is not None:
             depth = np.where(depth > 0, depth + np.float32(_BEHIND_M), np.float32(_NOTHING_M))
-        quality = _JPEG_QUALITY[is_sharp]
+            quality = _SHARP_JPEG_QUALITY
         self.client.scene.set_background_image(picture.image, "jpeg", jpeg_quality=quality, depth=depth)
         # Of a replay, which stands in place of the live table, the same nodes lie below its own.
         parts = ("/pusher", "/shadows", *(f"/objects/{name}" for name in names))

@@ -31,10 +31,8 @@ from osfcore.objects.asset_library import AssetLibrary
 
 DRAW_INTERVAL_S = 0.04
 _ROOT = "/replay"
-_TRACKED = f"/episode/estimate/{TRACKED}"
-_HIDDEN = {  # below the root of what is on view
-    "meshes": (_TRACKED,), "fields": (_TRACKED,), "beliefs": ("/objects", "/shadows", "/names"),
-}  # fmt: skip
+# What one may choose not to see, below the root of what is on view.
+_TRACKED, _TRUTH = f"/episode/estimate/{TRACKED}", ("/objects", "/shadows", "/names")
 Shows = Literal["meshes", "fields", "beliefs"]
 _MOST_PAGES = 200  # that are remembered; those that asked longest ago are forgotten
 _log = logging.getLogger(__name__)
@@ -88,7 +86,7 @@ class _View:
         self.nodes: ReplayNodes | None = None
         self._shown: tuple[Path, int] | None = None  # the file that they replay, and when it was last written
         self.picture = neural.add(
-            client, lambda: (live(), "") if (nodes := self.nodes) is None else (nodes.state(), _ROOT)
+            client, lambda: (live(), "") if (nodes := self.nodes) is None else (nodes.table.state(), _ROOT)
         )
 
     def opened(self, trajectory: Path, library: AssetLibrary) -> ReplayNodes:
@@ -220,23 +218,22 @@ class PageViews(Panel):
     def _draw_view(self, page: _Page, view: _View) -> None:
         with self._thread.changed:
             wish, since = page.wish, page.since
-        if wish.replay is not None:
-            self._draw_replay(page, view, wish.replay, time.monotonic() - since)
-        else:
+        root, replay = "", wish.replay
+        if replay is None:
             view.close()
-        root = _ROOT if wish.replay is not None else ""
-        view.picture.hidden.hide("page", {f"{root}{path}" for path in _HIDDEN[wish.shows]})
+        else:
+            root = _ROOT
+            at_s = replay.at_s + (replay.speed * (time.monotonic() - since) if replay.plays else 0.0)
+            nodes = view.opened(replay.trajectory, self._library)
+            nodes.at(at_s)
+            if replay.plays and at_s < nodes.clock.length_s:
+                with self._thread.changed:
+                    page.is_due = True
+                    self._thread.wake(DRAW_INTERVAL_S)
+        hidden = _TRUTH if wish.shows == "beliefs" else (_TRACKED,)
+        view.picture.hidden.hide("page", {f"{root}{path}" for path in hidden})
         self.neural.switch(view.picture, is_on=wish.shows == "fields")
         self.neural.moved(view.picture)
-
-    def _draw_replay(self, page: _Page, view: _View, wish: Replay, since_s: float) -> None:
-        nodes = view.opened(wish.trajectory, self._library)
-        at_s = wish.at_s + (wish.speed * since_s if wish.plays else 0.0)
-        nodes.at(at_s)
-        if wish.plays and at_s < nodes.clock.length_s:
-            with self._thread.changed:
-                page.is_due = True
-                self._thread.wake(DRAW_INTERVAL_S)
 
 
 class ReplayNodes:
@@ -246,40 +243,37 @@ class ReplayNodes:
         client: the browser.
         library: meshes of the objects.
         trajectory: of the episode, perhaps of one that goes on.
+
+    Attributes:
+        table: the objects, the pusher and the light.
+        clock: when what is on view.
     """
+
+    clock: ReplayClock
 
     def __init__(self, client: viser.ClientHandle, library: AssetLibrary, trajectory: Trajectory) -> None:
         self._client = client
         # Invisible nodes of a browser's own take the places of those that all browsers see, with all below them.
         self._hidden = [client.scene.add_frame(path, show_axes=False, visible=False) for path in LIVE_NODES]
-        # What is hidden as a whole needs a node of its own.
-        self._root, *_ = (client.scene.add_frame(f"{_ROOT}{path}", show_axes=False) for path in ("", "/objects"))
-        self._table = SceneNodes(client, library, root=_ROOT)
-        self._table.show_names(is_on=False)
-        self._episode = EpisodeNodes(client, library, self._table.names, root=f"{_ROOT}/episode")
-        client.scene.add_frame(f"{_ROOT}/episode/estimate/{TRACKED}", show_axes=False)
-        self._table.show(trajectory.states[0])
+        self._root = client.scene.add_frame(_ROOT, show_axes=False)
+        client.scene.add_frame(f"{_ROOT}/objects", show_axes=False)  # what is hidden as a whole needs a node of its own
+        self.table = SceneNodes(client, library, root=_ROOT)
+        self.table.show_names(is_on=False)
+        self._episode = EpisodeNodes(client, library, self.table.names, root=f"{_ROOT}/episode")
+        client.scene.add_frame(f"{_ROOT}{_TRACKED}", show_axes=False)
+        self.table.show(trajectory.states[0])
         self.follow(trajectory)
-
-    @property
-    def clock(self) -> ReplayClock:
-        """When what is on view."""
-        return self._clock
-
-    def state(self) -> SceneState:
-        """Read what is on view."""
-        return self._table.state()
 
     def follow(self, trajectory: Trajectory) -> None:
         """Replay a longer trajectory of the same episode from now on."""
-        self._trajectory, self._clock = trajectory, ReplayClock(trajectory)
+        self._trajectory, self.clock = trajectory, ReplayClock(trajectory)
         self._shown = Moment(-1.0)
 
     def at(self, at_s: float) -> None:
         """Show a moment [s]."""
-        moment, before = self._clock.moment(at_s), self._shown
+        moment, before = self.clock.moment(at_s), self._shown
         if moment.action != before.action:
-            self._table.place(self._trajectory.state_at(moment.action))
+            self.table.place(self._trajectory.state_at(moment.action))
         if moment.look is not before.look:
             self._show_look(moment.look)
         if moment.estimate is not before.estimate:

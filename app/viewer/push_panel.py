@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +32,6 @@ from osfcore.objects.asset_library import AssetLibrary
 
 TICK_S = 0.03  # between two pictures of a moving ghost
 _KEY = "viewer"
-_INTRO = "Starts from the **true poses** in the simulator."
 _IDLE = "Choose a push, then Predict"
 _EXECUTING, _EXECUTED = "Executing", "Executed. Purple: predicted; black: the true ways"
 _CHANGED = "The table has changed; predict again"
@@ -77,7 +76,7 @@ class PushPanel(Panel):
         self._has_plan = False  # whether anybody has begun to choose a push
         gui = server.gui
         with gui.add_folder("What will a push do?", expand_by_default=False):
-            gui.add_markdown(_INTRO)
+            gui.add_markdown("Starts from the **true poses** in the simulator.")
             self._controls = PushControls(server, self._replan)
             predict = gui.add_button("Predict", color="violet")
             self._execute_button = gui.add_button(
@@ -86,10 +85,9 @@ class PushPanel(Panel):
             self._status = gui.add_html(status("push", _IDLE))
             self._report = gui.add_html("", visible=False)
             self._player = PushPlayer(gui, self._thread)
-            clear = gui.add_button("Clear", hint="Remove what is drawn of a push.")
+            gui.add_button("Clear", hint="Remove what is drawn of a push.").on_click(lambda _: self._forget())
         predict.on_click(lambda event: self._run_command(partial(self._predict, event.client), event.client))
         self._execute_button.on_click(lambda event: self._run_command(self._execute, event.client))
-        clear.on_click(lambda _: self._forget())
 
     def _store(self, event: object) -> bool:
         match event:
@@ -174,18 +172,15 @@ class PushPanel(Panel):
         if prediction is not self._drawn:
             if prediction is None:
                 self._report.visible = False
-                self._player.close()
+                self._player.show(None)
                 self._nodes.clear()
             else:
                 message = self._draw_prediction(prediction)
             self._drawn = prediction
         if prediction is not None:
             self._nodes.at(self._player.advance() / STEP_S)
-        if self._status.content != status("push", message):
-            self._status.content = status("push", message)
-        is_idle = prediction is None or is_executed or self._executing is not None
-        if self._execute_button.disabled != is_idle:
-            self._execute_button.disabled = is_idle
+        self._status.content = status("push", message)
+        self._execute_button.disabled = prediction is None or is_executed or self._executing is not None
 
     def _take(
         self, answer: Future[NeuralAnswer], record: SceneRecord, actions: Float[np.ndarray, "T 3"], client: Client
@@ -222,7 +217,7 @@ class PushPanel(Panel):
         drawn = self._drawn
         if drawn is None or drawn.rollouts is not prediction.rollouts:
             self._nodes.show(prediction.rollouts)
-            self._player.open(len(prediction.actions) * STEP_S)
+            self._player.show(len(prediction.actions) * STEP_S)
         if prediction.truth:
             self._nodes.show_truth(prediction.truth)
             message = _EXECUTED if prediction.is_executed else _EXECUTING
@@ -371,19 +366,13 @@ class PushPlayer:
         self._slider.on_update(self._seek)
         self._button.on_click(lambda _: self._toggle())
 
-    def open(self, end_s: float) -> None:
-        """Show the end of another prediction, which lasts so long [s]."""
+    def show(self, end_s: float | None) -> None:
+        """Show the end of another prediction, which lasts so long [s]; None hides the elements."""
         with self._thread.changed:
-            self._end_s = self._shown_s = end_s
-            self._playing_since = None
-        self._slider.max = end_s
-        self._slider.visible = self._button.visible = True
-
-    def close(self) -> None:
-        """Hide the elements."""
-        with self._thread.changed:
-            self._end_s = self._playing_since = None
-        self._slider.visible = self._button.visible = False
+            self._end_s, self._shown_s, self._playing_since = end_s, end_s or 0.0, None
+        if end_s is not None:
+            self._slider.max = end_s
+        self._slider.visible = self._button.visible = end_s is not None
 
     def advance(self) -> float:
         """Update the elements and wake the thread again while playing; returns the moment to draw [s]."""
@@ -395,9 +384,7 @@ class PushPlayer:
             shown_s, is_playing = self._shown_s, self._playing_since is not None
             if is_playing:
                 self._thread.wake(TICK_S)
-        label = "Pause" if is_playing else "Play"
-        if self._button.label != label:
-            self._button.label = label
+        self._button.label = "Pause" if is_playing else "Play"
         if abs(float(self._slider.value) - shown_s) > 1e-6:
             self._slider.value = shown_s
         return shown_s
@@ -469,9 +456,8 @@ _HEAD = "text-align:right;padding-left:0.5em;font-weight:600;vertical-align:bott
 _CELL = "text-align:right;padding-left:0.5em;vertical-align:top;white-space:nowrap"
 
 
-def report(outcomes: Iterable[Outcome], labels: Mapping[str, str]) -> str:
+def report(rows: Sequence[Outcome], labels: Mapping[str, str]) -> str:
     """HTML of a table with a line for each object; labels, which users choose, are escaped."""
-    rows = tuple(outcomes)
     if not rows:
         return ""
     is_tried = rows[0].off_mm is not None

@@ -100,6 +100,7 @@ class Viewer:
         self.pages = PageViews(
             self._runner.library, self._server.page_of, self._drawing.state, self._neural, self._fields
         )
+        self._drawing.watch(self.pages.neural.moved)
         self._add_controls(self._server)
         self._panels = self._make_panels(self._server)
         self._server.on_client_connect(self._add_client)
@@ -136,7 +137,6 @@ class Viewer:
     def _make_panels(self, server: PrivateViser) -> tuple[Panel, ...]:
         """Make the panels, in the order of their folders."""
         library, table = self._runner.library, self._drawing
-        table.watch(self.pages.neural.moved)
         estimate = EstimatePanel(server, table, EstimateNodes(server, library, table.names))
         self._goal_panel = GoalPanel(server, library, self._goals, self._commands, self._run_command)
         episode = EpisodePanel(server, table, EpisodeNodes(server, library, table.names), estimate.forget)

@@ -11,8 +11,8 @@ import viser
 from jaxtyping import Float, UInt8
 
 from app.viewer.nodes.estimate_nodes import EstimateNodes
-from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of
-from app.viewer.nodes.room import NO_LINES, Colour, Label, Target, atomic
+from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of, segments
+from app.viewer.nodes.room import GAMMA, NO_LINES, Colour, Label, Target, atomic, colour_of
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.objects.asset_library import AssetLibrary
@@ -23,7 +23,6 @@ PARTS: tuple[Part, ...] = ("goal", "plan", "estimate")
 GOAL = (245, 140, 0)
 CHEAP, DEAR = (45, 215, 90), (150, 62, 58)
 PLAY_S, REST_S = 2.0, 0.7  # how long the best future is played, and stands at its end
-_GAMMA = 2.2
 _GOAL_OPACITY = 0.5
 _GOAL_SCALE = 1.015  # or ghosts and the surfaces below them would flicker
 _WAY_M, _BEST_M = 0.0025, 0.007  # thickness
@@ -150,11 +149,11 @@ class EpisodeNodes:
         heights = np.linspace(_CHEAPEST_Z_M, _DEAREST_Z_M, count)  # or lines that cross would flicker
         points = np.concatenate([sketch.ways, np.tile(heights[:, None, None], (1, moments, 1))], axis=2)
         colours = np.repeat(cost_colours(sketch.costs), moments - 1, axis=0)  # one for each segment
-        self._ways.points = _segments(points)
+        self._ways.points = segments(points)
         self._ways.colors = np.repeat(colours[:, None], 2, axis=1)
         best = sketch.best.pusher[:1].copy()
         best[..., 2] = _BEST_Z_M
-        self._best.points = _segments(best)
+        self._best.points = segments(best)
 
 
 def add_copy(scene: viser.SceneApi, path: str, library: AssetLibrary, name: str, *, opacity: float) -> viser.MeshHandle:
@@ -182,9 +181,4 @@ def cost_colours(costs: Float[np.ndarray, "W"]) -> UInt8[np.ndarray, "W 3"]:
 
 def _linear(colour: Colour) -> Colour:
     """Convert a colour for batches and for single points of lines: viser's client takes those for linear light."""
-    red, green, blue = (round(255 * (channel / 255) ** _GAMMA) for channel in colour)
-    return red, green, blue
-
-
-def _segments(ways: Float[np.ndarray, "W T1 3"]) -> Float[np.ndarray, "S 2 3"]:
-    return np.stack([ways[:, :-1], ways[:, 1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
+    return colour_of((channel / 255) ** GAMMA for channel in colour)

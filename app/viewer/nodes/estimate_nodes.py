@@ -13,7 +13,6 @@ from jaxtyping import Float
 from app.viewer.nodes.ghosts import (
     Mesh,
     add_ghosts,
-    below_table,
     box,
     footprint_m,
     heading_rad,
@@ -65,7 +64,7 @@ class _ObjectNodes:
         """Show where the object is; what was not looked for yet is hidden."""
         shown, hidden = (self.tracked, self.guess) if is_tracked else (self.guess, self.tracked)
         hidden.visible = False
-        move_ghosts(shown, Pose(pose.position[None], pose.quaternion[None]))
+        move_ghosts(shown, pose[None])
         shown.visible = bool(pose.position[2] > UNPLACED_BELOW_M)
 
     def paint(self, colour: Colour) -> None:
@@ -185,26 +184,15 @@ class EstimateNodes:
         return self._objects.values()
 
     def _add_object(self, name: str) -> _ObjectNodes:
-        mesh = mesh_of(self._library, name)
+        root, mesh = self._root, mesh_of(self._library, name)
         guess, tracked = (
-            add_ghosts(
-                self._scene,
-                f"{self._root}/{part}/{name}",
-                mesh,
-                below_table(1),
-                self._colour,
-                opacity,
-                scale=_WIRE_SCALE,
-                is_wire=True,
-                visible=False,
-            )
-            for part, opacity in (("guess", _WIRES), (TRACKED, _FAINT_WIRES))
+            add_ghosts(self._scene, path, mesh, 1, self._colour, opacity, scale=_WIRE_SCALE, is_wire=True)
+            for path, opacity in ((f"{root}/guess/{name}", _WIRES), (f"{root}/{TRACKED}/{name}", _FAINT_WIRES))
         )
         return _ObjectNodes(mesh[0], self._add_tried(f"tried/{name}", mesh, _TRIED, 0.2), guess, tracked)
 
     def _add_tried(self, path: str, mesh: Mesh, colour: Colour, opacity: float) -> viser.BatchedMeshHandle:
-        path = f"{self._root}/{path}"
-        return add_ghosts(self._scene, path, mesh, below_table(GHOSTS), colour, opacity, visible=False)
+        return add_ghosts(self._scene, f"{self._root}/{path}", mesh, GHOSTS, colour, opacity)
 
     def _show_light(self, light: Light, tried: np.ndarray | None, text: str) -> None:
         if not self._has_light:
@@ -220,52 +208,39 @@ class EstimateNodes:
     # The verdict
 
     def _judge(self, estimate: EstimatedState) -> None:
-        for n, nodes in enumerate(self._objects.values()):
-            nodes.paint(_DOUBTED if estimate.doubts[n] else _SURE)
-            self._add_bounds(estimate, n, nodes.vertices)
-        self._add_words(estimate)
+        """Say how sure each pose is, or why it is doubted, above the object and clear of all names."""
+        standing, texts, anchors = self._named(), [], []
+        for n, (name, nodes) in enumerate(self._objects.items()):
+            pose, doubt = estimate.state.poses[n], estimate.doubts[n]
+            nodes.paint(_DOUBTED if doubt else _SURE)
+            top = pose.position + np.array([0.0, 0.0, top_m(nodes.vertices, pose.quaternion)])
+            self._add_bounds(estimate, n, top)
+            far_mm, turn_deg = 1000 * _SIGMAS * estimate.position_std[n], np.rad2deg(_SIGMAS * estimate.rotation_std[n])
+            text = f"± {_two_digits(far_mm)} mm, ± {_two_digits(turn_deg)}° ({_SIGMAS:.0f}σ)"
+            text = f"DOUBTFUL: {doubt}" if doubt else text
+            texts.append(text if name in standing else f"{self._library.label(name)}: {text}")
+            anchors.append(top + np.array([0.0, 0.0, _LABEL_M]))
+        places = separated(np.array(anchors).reshape(-1, 3), texts, tuple(standing.values()))
+        for name, text, at in zip(self._objects, texts, places, strict=True):
+            path = f"{self._root}/verdict/{name}/words"
+            words = self._scene.add_label(path, text, position=at, font_screen_scale=0.75, anchor="bottom-center")
+            self._verdicts.append(words)
         within = f"± {_two_digits(np.rad2deg(_SIGMAS * estimate.light_std))}° ({_SIGMAS:.0f}σ)"
         self._show_light(estimate.state.light, None, f"estimated light {within}")
 
-    def _add_words(self, estimate: EstimatedState) -> None:
-        """How sure each pose is, or why it is doubted, above the object and clear of all names."""
-        standing, texts, anchors = self._named(), [], []
-        for n, name in enumerate(estimate.state.names):
-            pose = estimate.state.poses[n]
-            far_mm, turn_deg = 1000 * _SIGMAS * estimate.position_std[n], np.rad2deg(_SIGMAS * estimate.rotation_std[n])
-            text = f"± {_two_digits(far_mm)} mm, ± {_two_digits(turn_deg)}° ({_SIGMAS:.0f}σ)"
-            text = f"DOUBTFUL: {estimate.doubts[n]}" if estimate.doubts[n] else text
-            texts.append(text if name in standing else f"{self._library.label(name)}: {text}")
-            height_m = top_m(self._objects[name].vertices, pose.quaternion) + _LABEL_M
-            anchors.append(pose.position + np.array([0, 0, height_m]))
-        places = separated(np.array(anchors).reshape(-1, 3), texts, tuple(standing.values()))
-        self._verdicts += [
-            self._scene.add_label(
-                f"{self._root}/verdict/{name}/words",
-                text,
-                position=place,
-                font_screen_scale=0.75,
-                anchor="bottom-center",
-            )
-            for name, text, place in zip(estimate.state.names, texts, places, strict=True)
-        ]
-
-    def _add_bounds(self, estimate: EstimatedState, n: int, vertices: Float[np.ndarray, "P 3"]) -> None:
-        """A ball of two standard deviations on an object's top, and a sector of two around its heading."""
-        scene, name, pose = self._scene, estimate.state.names[n], estimate.state.poses[n]
-        position_std, rotation_std = float(estimate.position_std[n]), float(estimate.rotation_std[n])
+    def _add_bounds(self, estimate: EstimatedState, n: int, top: Float[np.ndarray, "3"]) -> None:
+        """Add a ball of two standard deviations on an object's top, and a sector of two around its heading."""
+        name, pose = estimate.state.names[n], estimate.state.poses[n]
         colour = _DOUBTED if estimate.doubts[n] else _SURE
-        top = pose.position + np.array([0.0, 0.0, top_m(vertices, pose.quaternion)])
-        ball_m = float(np.clip(_SIGMAS * position_std, _LEAST_BALL_M, _MOST_BALL_M))
-        turn_rad = float(np.clip(_SIGMAS * rotation_std, _LEAST_TURN_RAD, _MOST_TURN_RAD))
-        reach_m = footprint_m(vertices, pose.quaternion)
+        ball_m = float(np.clip(_SIGMAS * estimate.position_std[n], _LEAST_BALL_M, _MOST_BALL_M))
+        turn_rad = float(np.clip(_SIGMAS * estimate.rotation_std[n], _LEAST_TURN_RAD, _MOST_TURN_RAD))
+        reach_m = footprint_m(self._objects[name].vertices, pose.quaternion)
         flat = sector(heading_rad(pose.quaternion), turn_rad, reach_m + _RING_M[0], reach_m + _RING_M[1])
+        path = f"{self._root}/verdict/{name}"
         self._verdicts += [
-            scene.add_icosphere(
-                f"{self._root}/verdict/{name}/position", ball_m, colour, position=top, opacity=0.7, cast_shadow=False
-            ),
-            scene.add_mesh_simple(
-                f"{self._root}/verdict/{name}/turn",
+            self._scene.add_icosphere(f"{path}/position", ball_m, colour, position=top, opacity=0.7, cast_shadow=False),
+            self._scene.add_mesh_simple(
+                f"{path}/turn",
                 *flat,
                 color=colour,
                 opacity=0.8,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import viser
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 
 from app.viewer.nodes.room import NO_TURN, Colour
 from osfcore.errors import OsfError
@@ -44,9 +45,7 @@ def coarse(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], ce
     count = np.bincount(own)
     merged = np.stack([np.bincount(own, vertices[:, axis]) / count for axis in range(3)], axis=1)
     corners = own[faces]
-    kept = corners[
-        (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
-    ]
+    kept = corners[(np.diff(np.sort(corners, axis=1), axis=1) > 0).all(axis=1)]
     _, first = np.unique(np.sort(kept, axis=1), axis=0, return_index=True)
     return merged.astype(np.float32), kept[np.sort(first)].astype(np.uint32)
 
@@ -74,37 +73,33 @@ def add_ghosts(
     scene: viser.SceneApi,
     path: str,
     mesh: Mesh,
-    poses: Pose,
+    count: int,
     colour: Colour,
     opacity: float,
     *,
     scale: float = 1.0,
     shares: Float[np.ndarray, "N"] | None = None,
     is_wire: bool = False,
-    visible: bool = True,
 ) -> viser.BatchedMeshHandle:
-    """Add a node with translucent copies of a mesh, which cast no shadows.
+    """Add a hidden node with translucent copies of a mesh, which cast no shadows and have no place yet.
 
     Args:
         scene: to draw in.
         path: of the node.
         mesh: vertices [m] and faces.
-        poses: of the copies, a batch (N,).
+        count: of the copies.
         colour: of the copies, taken for linear light.
         opacity: of the copies.
         scale: of the mesh; copies as large as the surfaces below them would flicker.
         shares: of the opacity that each copy has; None is all of it.
         is_wire: whether edges are drawn in place of faces.
-        visible: whether it can be seen from the beginning.
     """
-    vertices, faces = mesh
     return scene.add_batched_meshes_simple(
         path,
-        vertices,
-        faces,
-        poses.quaternion.astype(np.float32),
-        poses.position.astype(np.float32),
-        batched_scales=np.full(len(poses.position), scale),
+        *mesh,
+        np.tile(NO_TURN, (count, 1)).astype(np.float32),
+        np.tile([0.0, 0.0, -1.0], (count, 1)).astype(np.float32),
+        batched_scales=np.full(count, scale),
         batched_colors=colour,
         batched_opacities=shares,
         opacity=opacity,
@@ -113,7 +108,7 @@ def add_ghosts(
         lod="off",
         cast_shadow=False,
         receive_shadow=False,
-        visible=visible,
+        visible=False,
     )
 
 
@@ -121,11 +116,6 @@ def move_ghosts(node: viser.BatchedMeshHandle, poses: Pose) -> None:
     """Move the copies of a node to a batch of poses (N,)."""
     node.batched_positions = poses.position.astype(np.float32)
     node.batched_wxyzs = poses.quaternion.astype(np.float32)
-
-
-def below_table(count: int) -> Pose:
-    """Make a batch of poses out of sight, for copies that have no place yet."""
-    return Pose(np.tile([0.0, 0.0, -1.0], (count, 1)), np.tile(NO_TURN, (count, 1)))
 
 
 def box(side_m: float) -> Mesh:
@@ -170,6 +160,11 @@ def moves(poses: Pose) -> bool:
 def way_of(rollouts: Rollouts, number: int) -> Pose:
     """Take the poses of an object in the first of some rollouts, one after each action."""
     return Pose(rollouts.positions[0, :, number], rollouts.quaternions[0, :, number])
+
+
+def segments(lines: Iterable[Float[np.ndarray, "_ 3"]]) -> Float32[np.ndarray, "S 2 3"]:
+    """Cut one or more lines through points into pieces from point to point, as viser draws them."""
+    return np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines]).astype(np.float32)
 
 
 def between(rows: Float[np.ndarray, "T C"], step: float) -> Float[np.ndarray, "C"]:
@@ -302,15 +297,12 @@ class FutureNodes:
         for n, name in enumerate(future.names):
             if self._ghosts[name].visible:
                 poses = way_of(future, n)
-                now = pose_at(poses, step)
                 still = poses[[*along_way(poses, self._style.on_the_way), *[-1] * self._style.has_end]]
-                positions = np.vstack([still.position, now.position])
-                move_ghosts(self._ghosts[name], Pose(positions, np.vstack([still.quaternion, now.quaternion])))
+                move_ghosts(self._ghosts[name], Pose.joined(still, pose_at(poses, step)[None]))
         self._pusher.position = between(future.pusher[0], step)
 
     def _add_ghosts(self, name: str) -> viser.BatchedMeshHandle:
         style = self._style
         shares = np.array([*[style.pale] * style.on_the_way, *[1.0] * style.has_end, 1.0])
-        path, mesh = f"{self._root}/{name}", mesh_of(self._library, name, FINE_CELLS)
-        places = below_table(len(shares))
-        return add_ghosts(self._scene, path, mesh, places, style.colour, style.opacity, scale=_SCALE, shares=shares)
+        path, mesh, count = f"{self._root}/{name}", mesh_of(self._library, name, FINE_CELLS), len(shares)
+        return add_ghosts(self._scene, path, mesh, count, style.colour, style.opacity, scale=_SCALE, shares=shares)

@@ -9,7 +9,18 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, TRUE, FutureNodes, FutureStyle, mesh_of, moves, top_m, way_of
+from app.viewer.nodes.ghosts import (
+    FINE_CELLS,
+    PREDICTED,
+    TRUE,
+    FutureNodes,
+    FutureStyle,
+    mesh_of,
+    moves,
+    segments,
+    top_m,
+    way_of,
+)
 from app.viewer.nodes.room import NO_LINES, atomic
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
@@ -60,7 +71,7 @@ class PushNodes:
         with self._lock, atomic(self._server):
             self._true_ways.visible, self._vertices = False, {}
             self._future.show(rollouts)
-            self._step = len(rollouts.pusher[0]) - 1.0
+            self._step = float(self._future.steps)
             self._future.at(self._step)
             self._draw_ways(self._ways, {name: way_of(rollouts, n) for n, name in enumerate(rollouts.names)})
 
@@ -75,10 +86,8 @@ class PushNodes:
     def show_truth(self, states: Sequence[SceneState]) -> None:
         """Show the ways that predicted objects, and others that moved, went in the simulation."""
         with self._lock, atomic(self._server):
-            ways = {}
-            for name in states[0].names if states else ():
-                poses = [state.pose(name) for state in states]
-                ways[name] = Pose(np.array([p.position for p in poses]), np.array([p.quaternion for p in poses]))
+            names = states[0].names if states else ()
+            ways = {name: Pose.stacked(state.pose(name) for state in states) for name in names}
             self._draw_ways(self._true_ways, ways)
 
     def clear(self) -> None:
@@ -101,13 +110,9 @@ class PushNodes:
 
 def _draw(node: viser.LineSegmentsHandle, lines: Sequence[np.ndarray]) -> None:
     """Put lines through points (P, 3) into one node; without lines it is hidden."""
-    parts = [np.stack([line[:-1], line[1:]], axis=1) for line in lines if len(line) > 1]
-    if parts:
-        points = np.concatenate(parts).astype(np.float32)
-        if not np.array_equal(node.points, points):
-            node.points = points
-    if node.visible != bool(parts):
-        node.visible = bool(parts)
+    if lines:
+        node.points = segments(lines)
+    node.visible = bool(lines)
 
 
 # Waypoints
@@ -146,8 +151,7 @@ class Waypoints:
     def show(self, count: int) -> None:
         """Show the first few handles; 0 hides all."""
         for number, handle in enumerate(self._handles):
-            if handle.visible != (number < count):
-                handle.visible = number < count
+            handle.visible = number < count
 
     def lay(self, start: Float[np.ndarray, "2"], heading_rad: float) -> None:
         """Put them in a row that begins at the pusher [m], within its reach."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ TABLE_THICKNESS_M = 0.04
 AXES_M = 0.12  # arrows on the table's corner, so that "push toward +x" means something
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 NO_LINES = np.zeros((1, 2, 3), np.float32)  # viser has no node of no lines
+GAMMA = 2.2  # of viser's colours
 _STILL = 1e-6  # poses that differ by less are not sent again
 Colour = tuple[int, int, int]
 Target = viser.ViserServer | viser.ClientHandle  # what draws for all browsers, or for one
@@ -51,9 +52,9 @@ def add_room(server: viser.ViserServer) -> None:
         scene.add_label(f"/axes/{name}", name, position=offset, font_screen_scale=0.8)
 
 
-def colour_of(albedo: tuple[float, float, float]) -> Colour:
-    """Convert an albedo to a colour as viser takes it."""
-    red, green, blue = (round(255 * channel) for channel in albedo)
+def colour_of(shares: Iterable[float]) -> Colour:
+    """Convert three shares of red, green and blue, such as an albedo, to a colour as viser takes it."""
+    red, green, blue = (round(255 * share) for share in shares)
     return red, green, blue
 
 
@@ -165,8 +166,7 @@ class LightMarker:
         """Show or hide it; without a text it has no words."""
         self._dot.visible, self._ray.visible = is_on, is_on and has_ray
         self._name.text, self._name.visible = text, is_on and bool(text)
-        if tuple(self._dot.colors) != colour:
-            self._dot.colors = self._ray.colors = np.array(colour, np.uint8)
+        self._dot.colors = self._ray.colors = np.array(colour, np.uint8)
 
     def remove(self) -> None:
         """Remove it."""

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from app.viewer.nodes.ghosts import UNKNOWN_M, Mesh, box
 from app.viewer.nodes.room import (
     AT,
+    GAMMA,
     LIGHT_COLOUR,
     NAMED_LIGHT_COLOUR,
     NO_TURN,
@@ -28,7 +29,7 @@ from app.viewer.nodes.room import (
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
-from osfcore.geometry.poses import Pose, quaternion_multiply, quaternion_to_matrix, rotate
+from osfcore.geometry.poses import Pose, quaternion_multiply, quaternion_to_matrix
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
 from osfcore.objects.asset_library import AssetLibrary
@@ -86,8 +87,7 @@ class SceneNodes:
         self._is_light_held = False
         self._has_names = True
         self._has_gizmos = False
-        self._light_requests: dict[str, tuple[bool, str]] = {}
-        self._lamp_look = True, ""  # whether it is visible, and the text beside it
+        self._light_requests: dict[str, tuple[bool, str]] = {}  # whether it is visible, and the text beside it
         self._shadows = ShadowNodes(self._scene, library, f"{root}/shadows")
         self._pusher = self._scene.add_cylinder(
             f"{root}/pusher",
@@ -118,7 +118,7 @@ class SceneNodes:
             self._grabbed.clear()
             self._is_light_held = False
             self._pusher.visible = state is not None
-            self._show_marker()
+            self._show_light()
             for frustum in self._frustums.values():
                 frustum.image = None
             self._shadows.show(None)
@@ -188,12 +188,7 @@ class SceneNodes:
         """
         with self._lock:
             self._light_requests[by] = is_on, name
-            others = [request for request in self._light_requests.values() if request != (True, "")]
-            is_on, name = max(others, default=(True, ""))
-            self._lamp_look = is_on, name
-            if self._light_gizmo is not None:
-                self._light_gizmo.visible = is_on
-            self._show_marker()
+            self._show_light()
 
     def show_names(self, is_on: bool) -> None:
         """Show or hide the objects' names."""
@@ -205,10 +200,9 @@ class SceneNodes:
     def show_gizmos(self, is_on: bool) -> None:
         """Show or hide the handles for moving objects."""
         with self._lock:
-            if is_on != self._has_gizmos:
-                self._has_gizmos = is_on
-                for gizmo in self._gizmos.values():
-                    gizmo.visible = is_on
+            self._has_gizmos = is_on
+            for gizmo in self._gizmos.values():
+                gizmo.visible = is_on
 
     def put_handles_back(self) -> None:
         """Send where the handles are once more: a browser may have moved its own."""
@@ -319,8 +313,12 @@ class SceneNodes:
         put(self._lamp, position)
         self._marker.place(position)
 
-    def _show_marker(self) -> None:
-        is_on, name = self._lamp_look
+    def _show_light(self) -> None:
+        """Show the light's handle and mark as the panels request it."""
+        others = [request for request in self._light_requests.values() if request != (True, "")]
+        is_on, name = max(others, default=(True, ""))
+        if self._light_gizmo is not None:
+            self._light_gizmo.visible = is_on
         colour = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR
         self._marker.show(is_on=is_on, has_ray=self._pusher.visible, text=name, colour=colour)
 
@@ -338,7 +336,6 @@ def light_toward(position: np.ndarray) -> Light | None:
 
 _ABOVE_M = 0.0007  # the table, so that it does not flicker
 _CORNERS = 20  # of the pusher's rim
-_GAMMA = 2.2  # of viser's colours
 _NOTHING = np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.uint32)
 Polygon = Float[np.ndarray, "K 2"]
 
@@ -371,19 +368,15 @@ class ShadowNodes:
             self._node.visible = self._is_on = state is not None
         if state is None:
             return
-        vertices, faces = shadow_mesh(self._hulls(state), state.light.position)
-        if not np.array_equal(vertices, self._node.vertices):
-            self._node.vertices, self._node.faces = vertices, faces
-        colour = shadow_colour(float(state.light.position[2]))
-        if tuple(self._node.color) != colour:
-            self._node.color = colour
+        self._node.vertices, self._node.faces = shadow_mesh(self._hulls(state), state.light.position)
+        self._node.color = shadow_colour(float(state.light.position[2]))
 
     def _hulls(self, state: SceneState) -> Iterable[Float[np.ndarray, "P 3"]]:
         """Yield world vertices of every convex part [m]."""
         for name in state.names:
             pose = state.pose(name)
             for part in self._parts_of(name):
-                yield rotate(pose.quaternion, part) + pose.position
+                yield pose.apply(part)
         if state.pusher is not None:
             yield state.pusher + _cylinder()
 
@@ -445,8 +438,7 @@ def shadow_colour(cosine: float) -> tuple[int, int, int]:
         cosine: of the angle between light and vertical.
     """
     share = AMBIENT / (AMBIENT + DIFFUSE * cosine)
-    red, green, blue = (round(255 * albedo * share ** (1 / _GAMMA)) for albedo in TABLE_ALBEDO)
-    return red, green, blue
+    return colour_of(albedo * share ** (1 / GAMMA) for albedo in TABLE_ALBEDO)
 
 
 def _cylinder() -> Float[np.ndarray, "P 3"]:
