@@ -141,7 +141,7 @@ def read_centres(models: Path | None) -> Mapping[str, Float[np.ndarray, "3"]]:
     if models is None:
         return dict.fromkeys(NAMES, np.zeros(3))
     entries = read_json(models / MODELS_INFO, lambda data: decode(dict[str, _ModelJson], data, MODELS_INFO))
-    known = {str(number): name_of(number) for number in range(1, len(NAMES) + 1)}
+    known = {str(number): name for number, name in enumerate(NAMES, 1)}
     return {
         known[number]: 1e-3 * np.array([e.min_x + e.size_x / 2, e.min_y + e.size_y / 2, e.min_z + e.size_z / 2])
         for number, e in entries.items()
@@ -604,8 +604,7 @@ def read_images(folder: Path, choice: BopChoice | None = None) -> tuple[BopImage
     choice = choice or BopChoice()
     entries, centres = read_json(folder / SCENE_CAMERA, parse), read_centres(choice.models)
     numbers = _chosen(choice.images, tuple(entries))
-    poses = (_annotated(folder, number, centres) for number in numbers)
-    return tuple(_image(folder, n, entries[n], its, choice.encoding) for n, its in zip(numbers, poses, strict=True))
+    return tuple(_image(folder, n, entries[n], _annotated(folder, n, centres), choice.encoding) for n in numbers)
 
 
 def _chosen(asked: tuple[int, ...] | None, there: tuple[int, ...]) -> tuple[int, ...]:

@@ -456,10 +456,10 @@ class Client:
             content, kind, name = encode_png(to_uint8(photo)), "image/png", name or "Photo"
         else:
             path = Path(photo)
-            kind = f"image/{_KINDS.get(path.suffix.lower())}"
-            if path.suffix.lower() not in _KINDS or not path.is_file():
+            suffix = path.suffix.lower()
+            if suffix not in _KINDS or not path.is_file():
                 raise InvalidInput("photo", path, f"a file that is there and ends in {', '.join(_KINDS)}")
-            content, name = path.read_bytes(), name or path.stem
+            content, kind, name = path.read_bytes(), f"image/{_KINDS[suffix]}", name or path.stem
         return Goal.of(self._service.send("POST", "/api/goals", content, kind, name=name))
 
     def goal_of(

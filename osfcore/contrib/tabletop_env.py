@@ -16,6 +16,7 @@ Raises:
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -112,10 +113,10 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._library = AssetLibrary((default_data_dir() if data_dir is None else Path(data_dir)) / "objects")
         check_request(self._library, SceneRequest(count=objects, among=names))
         self.objects_to_choose_from = self._library.names() if names is None else tuple(names)
-        self._family: Family = family
+        self._tasks = TaskSet(self.objects_to_choose_from, family, objects)
+        check_tasks(self._tasks)
         self._kind: Kind = obs
-        self._count, self.render_mode = objects, render_mode
-        check_tasks(self._tasks(0))
+        self.render_mode = render_mode
         self._cameras = default_cameras(image_side)
         self._goal_camera = goal_camera(image_side)
         self._symmetries = {name: self._library.info(name).symmetry for name in self.objects_to_choose_from}
@@ -170,9 +171,6 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """Free the simulation."""
         self._world.close()
 
-    def _tasks(self, seed: int) -> TaskSet:
-        return TaskSet(self.objects_to_choose_from, self._family, self._count, seed)
-
     def _drawn(self) -> RearrangementTask:
         """Draw a random task."""
         for _ in range(_DRAWS - 1):
@@ -181,7 +179,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return self._numbered(int(self.np_random.integers(_SEEDS)), int(self.np_random.integers(_TURNS)))
 
     def _numbered(self, seed: int, number: int) -> RearrangementTask:
-        return draw_task(self._library, self._tasks(seed), number).task
+        return draw_task(self._library, replace(self._tasks, seed=seed), number).task
 
     def _asked(self, options: dict[str, Any]) -> RearrangementTask:
         """Draw the task that options name."""
@@ -220,8 +218,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         spaces: dict[str, gymnasium.Space[Any]] = {"pusher": box(-PUSHER_REACH_M, PUSHER_REACH_M, (2,), np.float64)}
         goal: dict[str, gymnasium.Space[Any]] = {}
         if self._kind != "pixels":
-            spaces["objects"] = gymnasium.spaces.MultiDiscrete([len(self.objects_to_choose_from)] * self._count)
-            limits = np.tile([TABLE_SIDE_M] * 3 + [1.0] * 4, (self._count, 1))
+            spaces["objects"] = gymnasium.spaces.MultiDiscrete([len(self.objects_to_choose_from)] * self._tasks.objects)
+            limits = np.tile([TABLE_SIDE_M] * 3 + [1.0] * 4, (self._tasks.objects, 1))
             spaces["poses"] = goal["poses"] = box(-limits, limits, dtype=np.float64)
         if self._kind != "poses":
             spaces["pixels"] = box(0, 255, (len(self._cameras), side, side, 3), np.uint8)

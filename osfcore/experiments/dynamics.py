@@ -33,6 +33,7 @@ from osfcore.dynamics.train import has_held_out_pair
 from osfcore.errors import InvalidInput
 from osfcore.experiments.bench_rollouts import BENCH_NAMES, bench_rollouts
 from osfcore.experiments.charts import Axis, Chart, Curve, write_charts
+from osfcore.experiments.factors import UNSEEN_NETWORK
 from osfcore.experiments.harness import EvaluationStep, check_run, chosen_objects
 from osfcore.experiments.rivals.quasistatic import push
 from osfcore.fields.field_library import FieldLibrary
@@ -389,7 +390,7 @@ def report_json(report: DynamicsReport) -> dict[str, Any]:
     result["by_objects"] = {str(count): _row(report.of_count(count)) for count in report.counts}
     result["by_policy"] = {key.split()[0]: _row([s]) for key, s in report.by_set.items() if key.endswith(" 3")}
     names = sorted({name for s in main for row in s.windows.names for name in row})
-    result["by_name"] = {name: _after_four(main, "network", lambda one, name=name: one == name) for name in names}
+    result["by_name"] = {name: _after_four(main, "network", (name,)) for name in names}
 
     def held_out(names: tuple[str, ...]) -> list[bool]:
         return [has_held_out_pair(names)] * len(names)
@@ -399,7 +400,7 @@ def report_json(report: DynamicsReport) -> dict[str, Any]:
     result["unseen_pairs"] = {"windows": len(mm), "median_mm_4": _median(mm), "constant_mm_4": _median(way)}
     # What it costs never to have seen an object: errors in the same windows by both networks.
     scored = [] if report.unseen is None else [report.unseen]
-    without, seen = (_after_four(scored, who, report.unseen_names.__contains__) for who in ("without", "network"))
+    without, seen = (_after_four(scored, who, report.unseen_names) for who in ("without", "network"))
     return result | {
         "unseen_objects": list(report.unseen_names if scored else ()),
         "unseen_objects_windows": without["windows"],
@@ -423,11 +424,11 @@ def _row(scored: Sequence[Scored]) -> dict[str, Any]:
     }
 
 
-def _after_four(scored: Sequence[Scored], who: str, is_chosen: Callable[[str], bool]) -> dict[str, Any]:
-    """Return errors after four actions of objects with chosen names."""
+def _after_four(scored: Sequence[Scored], who: str, among: tuple[str, ...]) -> dict[str, Any]:
+    """Return errors after four actions of objects with these names."""
 
     def chosen(names: tuple[str, ...]) -> list[bool]:
-        return [is_chosen(name) for name in names]
+        return [name in among for name in names]
 
     mm, deg = (_moved(scored, who, 4, deg=deg, chosen=chosen) for deg in (False, True))
     return {"windows": len(mm), "median_mm_4": _median(mm), "median_deg_4": _median(deg)}
@@ -574,7 +575,6 @@ COUNTS = (2, 3, 4, 6)  # objects in a scene
 _STEPS = 50
 _OTHERS = 2  # objects beside unseen ones
 _UNSEEN = "unseen"
-_SECOND_NETWORK = "pushes_without_two"
 
 
 @dataclass(frozen=True, slots=True)
@@ -636,7 +636,7 @@ def evaluate_dynamics(
     if len(names) < min(COUNTS) + 1:
         raise InvalidInput("number of objects with a field and a mesh", len(names), f"at least {min(COUNTS) + 1}")
     # Objects that the second shipped network has not seen, as far as they are there; the paper's has none.
-    hidden = read_metrics(shipped(_SECOND_NETWORK)).get("without", ()) if config.method == "ours" else ()
+    hidden = read_metrics(shipped(UNSEEN_NETWORK)).get("without", ()) if config.method == "ours" else ()
     unseen = tuple(name for name in hidden if name in names)
     sets = _sets(config, names, unseen)
     total = 2 * len(sets) + 1
@@ -656,7 +656,7 @@ def evaluate_dynamics(
         network = predictor.predict(windows)
         predictions = {"network": network, "constant": constant(windows), "analytic": analytic(shapes, windows)}
         if entry.key == _UNSEEN:
-            predictions["without"] = learned(read_network(shipped(_SECOND_NETWORK)), shapes, windows)
+            predictions["without"] = learned(read_network(shipped(UNSEEN_NETWORK)), shapes, windows)
         found = {who: errors(windows, predicted, symmetries) for who, predicted in predictions.items()}
         scored[entry.key] = Scored(windows, network, found)
     yield EvaluationStep(total - 1, total, "Timing rollouts")

@@ -53,12 +53,12 @@ from osfcore.experiments.statistics import mean, median, quantile, spread
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
 from osfcore.geometry.states import MAX_OBJECTS, EstimatedState, Observation, SceneState
-from osfcore.inspection.contact_sheet import Comparison, contact_sheet, put_text
+from osfcore.inspection.contact_sheet import Comparison, contact_sheet, put_text, stacked
 from osfcore.io.files import write_json
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.json_codec import decode, encode
 from osfcore.io.scene_file import estimated_from_json, estimated_to_json
-from osfcore.metrics.pose_errors import adds, direction_components, rotation_components, rotation_error
+from osfcore.metrics.pose_errors import adds, direction_components, pose_error, rotation_components
 from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
@@ -315,7 +315,7 @@ class TaskRunner:
     def _spoiled(self, number: int, seed: int) -> TaskResult:
         models, config, rng = self._models, self._config, stream_rng(seed, Stream.FIRST_FRAME)
         case = tasks.bad_case(self._names, config.objects, config.seed, number, self._library, config.size)
-        began, estimate, refused = time.perf_counter(), None, ""
+        began = time.perf_counter()
         try:
             steps = estimate_first(models, case.observation if case.start is None else case.start, rng, config.effort)
             if case.start is not None:
@@ -324,16 +324,17 @@ class TaskRunner:
                 steps = estimate_goal(models, case.observation, prior, config.goal)
             estimate = last_estimate(steps)
         except OsfError as error:
-            refused = str(error)
+            seconds = time.perf_counter() - began
+            score = BadScore(case.kind, str(error), "", is_right=False, seconds=seconds)
+            return TaskResult({"score": encode(score)}, self._compared(case.observation, None))
         seconds = time.perf_counter() - began
-        score = BadScore(case.kind, refused, "", is_right=False, seconds=seconds)
-        if estimate is not None:  # an answer that names an object that is not there is wrong
-            there = [n for n, name in enumerate(estimate.state.names) if name in case.truth.names]
-            names = tuple(estimate.state.names[n] for n in there)
-            state = replace(estimate.state, names=names, poses=estimate.state.poses[there])
-            shifts, turns = (tuple(one.tolist()) for one in pose_errors(state, case.truth, self._meshes(names)))
-            are_right = len(names) == len(estimate.state.names) and all(map(is_right, shifts, turns))
-            score = BadScore(case.kind, "", estimate.reason, are_right, shifts, turns, seconds)
+        # An answer that names an object that is not there is wrong.
+        there = [n for n, name in enumerate(estimate.state.names) if name in case.truth.names]
+        names = tuple(estimate.state.names[n] for n in there)
+        state = replace(estimate.state, names=names, poses=estimate.state.poses[there])
+        shifts, turns = (tuple(one.tolist()) for one in pose_errors(state, case.truth, self._meshes(names)))
+        are_right = len(names) == len(estimate.state.names) and all(map(is_right, shifts, turns))
+        score = BadScore(case.kind, "", estimate.reason, are_right, shifts, turns, seconds)
         return TaskResult({"score": encode(score)}, self._compared(case.observation, estimate))
 
     def _timed(self, steps: Iterator[EstimateStep], frame: tasks.Frame) -> tuple[FrameScore, EstimatedState | None]:
@@ -540,10 +541,9 @@ def pose_errors(
         truth: of the same objects, in any order.
         assets: by name; their symmetries say which rotations look alike.
     """
-    pairs = [(estimate.pose(name), truth.pose(name), assets[name].info.symmetry) for name in estimate.names]
-    shift = [1000 * np.linalg.norm(mine.position - true.position) for mine, true, _ in pairs]
-    turn = [np.rad2deg(rotation_error(alike, mine.quaternion, true.quaternion)) for mine, true, alike in pairs]
-    return np.array(shift), np.array(turn)
+    names = estimate.names
+    pairs = [pose_error(assets[name].info.symmetry, estimate.pose(name), truth.pose(name)) for name in names]
+    return np.array([mm for mm, _ in pairs]), np.array([deg for _, deg in pairs])
 
 
 def score_frame(
@@ -739,11 +739,7 @@ def _report(kept: Mapping[str, Sequence[TaskResult]]) -> EstimateReport:
     return EstimateReport(
         first=scores(FrameScore, "first"),
         tracks=scores(TrackScore, "track") if "track" in kept else None,
-        goals=tuple(
-            tuple(decode(FrameScore, score, "score") for score in task.figures["scores"]) for task in kept["goal"]
-        )
-        if "goal" in kept
-        else None,
+        goals=tuple(map(goals, kept["goal"])) if "goal" in kept else None,
         fixed_light=scores(FrameScore, "fixed_light") if "fixed_light" in kept else None,
         views={n: scores(FrameScore, f"views_{n}") for n in VIEWS} if "fixed_light" in kept else None,
         bad=scores(BadScore, "bad") if "bad" in kept else None,
@@ -1072,9 +1068,7 @@ def write_gallery(path: Path, failures: Iterable[Failure | None]) -> None:
         for number, line in enumerate(failure.lines):
             put_text(words, line, (4, _LINE_PX * (number + 1) - 4), words.shape[1] - 8)
         blocks += [words, sheet]
-    width = max(block.shape[1] for block in blocks)
-    padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=255) for b in blocks]
-    write_png(path, np.vstack(padded))
+    write_png(path, stacked(blocks))
 
 
 def _write_galleries(folder: Path, report: EstimateReport, kept: Mapping[str, Sequence[TaskResult]]) -> None:

@@ -122,8 +122,10 @@ def load_appearance(method: str, names: Iterable[str], fields: FieldLibrary, dat
         UnknownName: if an object has no such field.
         CorruptFile: if a file is broken.
     """
-    if method in ("paper", "nerf"):
-        return (load_paper_appearance if method == "paper" else load_nerf_appearance)(names, fields, data_dir)
+    if method == "paper":
+        return load_paper_appearance(names, fields, data_dir)
+    if method == "nerf":
+        return load_nerf_appearance(names, fields, data_dir)
     return ObjectModels({name: fields.load(name) for name in names}, fields.load_table())
 
 

@@ -34,7 +34,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, un
 from osfcore.inspection.contact_sheet import write_sheet
 from osfcore.io.files import read_json, write_json
 from osfcore.io.json_codec import Entry, Matrix3, Text, Vector3, Vector4, decode
-from osfcore.metrics.pose_errors import rotation_error
+from osfcore.metrics.pose_errors import pose_error
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.photo.lamp import ShadedPixels, fit_lamp
 from osfcore.photo.photograph import Photograph
@@ -441,9 +441,7 @@ def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject, mask
     iou, depth_mm = _fit(renderer, scene, name, pose)
     position_mm = rotation_deg = None
     if (reference := scene.reference.get(name)) is not None:
-        symmetry = CATALOGUE[name].symmetry
-        rotation_deg = float(np.rad2deg(rotation_error(symmetry, pose.quaternion, reference.quaternion)))
-        position_mm = 1e3 * float(np.linalg.norm(pose.position - reference.position))
+        position_mm, rotation_deg = pose_error(CATALOGUE[name].symmetry, pose, reference)
     ratio = found.rivals[0].loss / max(found.best.loss, 1e-9) if found.rivals else np.inf
     return PhotoScore(
         scene=scene.name,

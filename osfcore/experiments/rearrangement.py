@@ -78,7 +78,7 @@ from osfcore.inspection.contact_sheet import Comparison, contact_sheet
 from osfcore.io.files import write_json
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.json_codec import decode
-from osfcore.metrics.pose_errors import rotation_error
+from osfcore.metrics.pose_errors import pose_error
 from osfcore.metrics.success import SUCCESS_M, RearrangementScore, RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.objects.asset_library import AssetLibrary
@@ -130,19 +130,13 @@ def prediction_errors(course: Course, models: SceneModels) -> dict[str, list[flo
         rollouts = models.dynamics.rollout(state, actions[None], course.estimated.get(start - 1))
         before, after = course.true[start], course.true[start + AHEAD]
         for n, name in enumerate(rollouts.names):
-            way_mm, way_deg = _apart(models.symmetries[name], before.pose(name), after.pose(name))
+            way_mm, way_deg = pose_error(models.symmetries[name], before.pose(name), after.pose(name))
             if way_mm > MOVED_MM or way_deg > MOVED_DEG:
                 predicted = Pose(rollouts.positions[0, AHEAD, n], rollouts.quaternions[0, AHEAD, n])
-                mm, deg = _apart(models.symmetries[name], predicted, after.pose(name))
+                mm, deg = pose_error(models.symmetries[name], predicted, after.pose(name))
                 errors["mm"].append(round(mm, 3))
                 errors["deg"].append(round(deg, 3))
     return errors
-
-
-def _apart(symmetry: Symmetry, one: Pose, other: Pose) -> tuple[float, float]:
-    """Return distance [mm] and angle [deg] between two poses of an object."""
-    mm = 1000 * float(np.linalg.norm(one.position - other.position))
-    return mm, float(np.rad2deg(rotation_error(symmetry, one.quaternion, other.quaternion)))
 
 
 # Single episodes, measured: those of methods that see images, and of the planner that knows the truth.
@@ -274,8 +268,6 @@ class _Log:
                     self._note_end(event.outcome, event.number)
                 case Ended():
                     ended = event
-                case _:
-                    pass
         assert ended is not None  # for the type checker
         self.figures["episode_s"] = round(time.perf_counter() - began, 2)
         return ended

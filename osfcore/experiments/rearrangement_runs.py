@@ -241,6 +241,12 @@ class Ended:
     image: Float[np.ndarray, "h w 3"]
     goal: Float[np.ndarray, "h w 3"]
 
+    @staticmethod
+    def of(world: Tabletop, goal: GoalImage) -> Ended:
+        """Return how a table is now, under the camera of its goal image."""
+        image = world.render((goal.camera,), with_pusher=False).images[0]
+        return Ended(world.truth(), image, goal.image)
+
 
 def run_from_images(
     task: RearrangementTask,
@@ -284,7 +290,7 @@ def run_from_images(
             if isinstance(event, Stepped):
                 yield TrueState(world.truth())
             yield event
-        yield _ended(world, goal)
+        yield Ended.of(world, goal)
 
 
 def run_told_the_truth(
@@ -310,8 +316,8 @@ def run_told_the_truth(
         world = stack.enter_context(contextlib.closing(Tabletop(assets)))
         rollout: Rollout = models.pushes.rollout
         if knows_pushes:
-            meshes = {name: assets.load(name) for name in task.start.names}
-            rollout = stack.enter_context(contextlib.closing(SimulatedPushes(meshes))).rollout
+            simulated = SimulatedModel(assets, task.start.names)
+            rollout = stack.enter_context(contextlib.closing(simulated)).rollout
         world.restore(task.goal)
         camera = goal_camera()
         goal = GoalImage(camera, world.render((camera,), with_pusher=False).images[0])
@@ -332,9 +338,4 @@ def run_told_the_truth(
                 world.act(action)
             planner.shift(len(actions))
             left -= len(actions)
-        return _ended(world, goal)
-
-
-def _ended(world: Tabletop, goal: GoalImage) -> Ended:
-    image = world.render((goal.camera,), with_pusher=False).images[0]
-    return Ended(world.truth(), image, goal.image)
+        return Ended.of(world, goal)

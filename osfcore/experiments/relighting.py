@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 
 from osfcore.errors import InvalidInput
 from osfcore.experiments.charts import Axis
-from osfcore.experiments.fields import MEASURES, compare_scene, figures_of, mean_of, render_scene, simulate_relit
+from osfcore.experiments.fields import MEASURES, compare_scene, figures_of, render_scene, simulate_relit
 from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult
 from osfcore.experiments.images import (
     FIELD_METHODS,
@@ -29,6 +29,7 @@ from osfcore.experiments.images import (
     load_appearance,
     shown_circumstances,
 )
+from osfcore.experiments.statistics import mean
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
@@ -122,7 +123,7 @@ def show_relit(
     scenes = [compare_scene(truth, render_scene(renderer, truth)) for truth in truths]
     figures = [figures_of(scene) for scene in scenes]
     return TaskResult(
-        {key: [mean_of([one], key) for one in figures] for key in MEASURES},
+        {key: [mean(one[key]) for one in figures] for key in MEASURES},
         tuple(
             replace(scenes[n][0].comparison, label=f"{config.elevations_deg[n]:g} deg")
             for n in sorted({0, len(scenes) // 2, len(scenes) - 1})

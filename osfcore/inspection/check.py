@@ -51,9 +51,9 @@ def check_places(images: Sequence[BopImage]) -> None:
     Raises:
         InvalidInput: naming the first that does not fit: K, or a pose, is of other images.
     """
-    fits = [(image, name, _fits(image, name)) for image in images for name in image.masks if name in image.poses]
-    wrong = [(image, name) for image, name, is_fit in fits if not is_fit]
-    if len(wrong) > _SHARE * len(fits):
+    known = [(image, name) for image in images for name in image.masks if name in image.poses]
+    wrong = [(image, name) for image, name in known if not _fits(image, name)]
+    if len(wrong) > _SHARE * len(known):
         image, name = wrong[0]
         u, v = image.camera.project(image.poses[name].position)
         what = f"place of {name} in image {image.number} by cam_K and cam_t_m2c [px]"

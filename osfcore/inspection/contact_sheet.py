@@ -65,6 +65,11 @@ def contact_sheet(
         differences = [DIFFERENCE_GAIN * np.abs(c.truth.astype(int) - c.ours) for c in shown]
         rows[f"diff x{DIFFERENCE_GAIN}"] = [np.clip(difference, 0, 255).astype(np.uint8) for difference in differences]
         blocks.append(_grid(rows, [c.label for c in shown], _ROW_LABEL_PX))
+    return stacked(blocks)
+
+
+def stacked(blocks: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> UInt8[np.ndarray, "H W 3"]:
+    """Put pictures of any width below each other, with white to the right of the narrower ones."""
     width = max(block.shape[1] for block in blocks)
     padded = [np.pad(b, ((0, 0), (0, width - b.shape[1]), (0, 0)), constant_values=_PAPER) for b in blocks]
     return np.vstack(padded)

@@ -107,8 +107,7 @@ def _write_images(folder: Path, observation: Observation) -> dict[str, Any]:
 
 
 def _check(observation: Observation) -> None:
-    _check_cameras(observation.cameras)
-    _check_objects(observation.names)
+    _check_listed(observation.cameras, observation.names)
     camera, views, count = observation.cameras[0], len(observation.cameras), len(observation.names)
     shapes = {"images": (views, camera.height, camera.width, 3)}
     if observation.masks is not None:
@@ -126,8 +125,7 @@ def _check(observation: Observation) -> None:
 def _observation(folder: Path, data: object) -> Observation:
     entry = decode(ObservationJson, data, "observation")
     cameras, names, files = tuple(c.camera() for c in entry.cameras), tuple(entry.objects), entry.images
-    _check_cameras(cameras)
-    _check_objects(names)
+    _check_listed(cameras, names)
     check_known("camera", files, {camera.name for camera in cameras})
     if missing := [camera.name for camera in cameras if camera.name not in files]:
         raise InvalidInput(f"image of camera {shown(missing[0])}", "missing", "given")
@@ -140,15 +138,12 @@ def _observation(folder: Path, data: object) -> Observation:
     return Observation(cameras, images, names, masks, pusher, entry.time_s)
 
 
-def _check_cameras(cameras: tuple[Camera, ...]) -> None:
+def _check_listed(cameras: tuple[Camera, ...], names: tuple[str, ...]) -> None:
     check_ranges(("number of cameras", len(cameras), 1, MAX_CAMERAS))
     check_unique("names of the cameras", [camera.name for camera in cameras], "all different")
     sizes = [f"{camera.width} x {camera.height}" for camera in cameras]
     if len(set(sizes)) != 1:
         raise InvalidInput("sizes of the cameras [px]", ", ".join(sizes), "the same")
-
-
-def _check_objects(names: tuple[str, ...]) -> None:
     check_ranges(("number of objects", len(names), 1, MAX_OBJECTS))
     if not all(names):
         raise InvalidInput("objects", list(names), "a list of names")

@@ -115,8 +115,7 @@ class StateJson(Entry):
     @staticmethod
     def of(state: SceneState) -> StateJson:
         """Make one of a state."""
-        light = PointJson.of(state.light.position)
-        return StateJson(objects=posed_objects(state), light=light, **pusher_of(state))
+        return StateJson(objects=posed_objects(state), light=PointJson.of(state.light.position), **pusher_of(state))
 
     def state(self) -> SceneState:
         """Return the state.
@@ -124,11 +123,10 @@ class StateJson(Entry):
         Raises:
             InvalidInput: if a value is out of range.
         """
-        positions = np.array([entry.position for entry in self.objects]).reshape(-1, 3)
-        quaternions = np.array([entry.quaternion for entry in self.objects]).reshape(-1, 4)
+        poses = Pose.stacked(entry.pose() for entry in self.objects)
         pusher = None if self.pusher is None else np.array(self.pusher.position)
         names = tuple(entry.name for entry in self.objects)
-        return SceneState(names, Pose(positions, quaternions), Light(np.array(self.light.position)), pusher)
+        return SceneState(names, poses, Light(np.array(self.light.position)), pusher)
 
 
 class SceneJson(StateJson):

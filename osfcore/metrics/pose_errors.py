@@ -31,6 +31,12 @@ def rotation_error(symmetry: Symmetry, estimated: Float[np.ndarray, "4"], true: 
     return float(np.linalg.norm(rotation_components(symmetry, estimated, true)))
 
 
+def pose_error(symmetry: Symmetry, estimated: Pose, true: Pose) -> tuple[float, float]:
+    """Return the distance [mm] and the angle [deg] between two poses of an object, symmetries considered."""
+    mm = 1000 * float(np.linalg.norm(estimated.position - true.position))
+    return mm, float(np.rad2deg(rotation_error(symmetry, estimated.quaternion, true.quaternion)))
+
+
 def rotation_components(
     symmetry: Symmetry, estimated: Float[np.ndarray, "4"], true: Float[np.ndarray, "4"]
 ) -> Float[np.ndarray, "C"]:

@@ -236,19 +236,14 @@ class AssetLibrary:
             return ()
         return tuple(sorted(entry.name for entry in self.root.iterdir() if _is_plain(entry.name) and entry.is_dir()))
 
-    def _facts(self, name: str) -> dict[str, Any]:
-        path = self.root / name / _FACTS
-        try:
-            facts = json.loads(path.read_text(encoding="utf-8"))
-            return {"format_version": 0, **facts}
-        except (ValueError, TypeError) as error:
-            raise CorruptFile(path, "it is not valid JSON") from error
-
     def _known_facts(self, name: str) -> dict[str, Any]:
+        path = self.root / name / _FACTS
         try:
             if not _is_plain(name):
                 raise FileNotFoundError(name)
-            facts = self._facts(name)
+            facts = {"format_version": 0, **json.loads(path.read_text(encoding="utf-8"))}
+        except (ValueError, TypeError) as error:
+            raise CorruptFile(path, "it is not valid JSON") from error
         except OSError:
             if name in CATALOGUE:
                 raise MissingAssets([name]) from None

@@ -396,9 +396,9 @@ class NewObject:
         check_name(self.name)
         if self.name in CATALOGUE:
             raise InvalidInput("object name", repr(self.name), "different from the names of the catalogue")
-        if not (math.isfinite(self.mass_kg) and 0 < self.mass_kg <= MAX_MASS_KG):
+        if not 0 < self.mass_kg <= MAX_MASS_KG:
             raise InvalidInput("mass [kg]", self.mass_kg, f"above 0 and at most {MAX_MASS_KG:g}")
-        if not (math.isfinite(self.scale) and self.scale > 0):
+        if not 0 < self.scale < math.inf:
             raise InvalidInput("scale", self.scale, "above 0")
         for what, text in (("label", self.label), ("licence", self.licence)):
             if not text.isprintable() or len(text) > MAX_TEXT:  # unprintable: surrogates of broken encodings too

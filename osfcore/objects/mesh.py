@@ -171,12 +171,12 @@ def check_upload(file: Path) -> bool:
     """
     with file.open("rb") as source:
         magic = source.read(4)
-    is_glb = magic == _GLB_MAGIC
-    if not is_glb and not magic.startswith(_ZIP_MAGIC):
+    if magic == _GLB_MAGIC:
+        return True
+    if not magic.startswith(_ZIP_MAGIC):
         raise CorruptFile(file, f"it is neither a GLB nor a zip; send {_EXPECTED}")
-    if not is_glb:
-        check_zip(file, MAX_FILES)
-    return is_glb
+    check_zip(file, MAX_FILES)
+    return False
 
 
 def unpack_mesh(file: Path, out: Path) -> Path:

@@ -32,7 +32,7 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.progress import Progress
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.imaging import RayTracer, TracedMesh
-from osfcore.world.scenes import SceneRequest, check_object
+from osfcore.world.scenes import SceneRequest
 from osfcore.world.tabletop import Tabletop
 
 # Image sets for training fields: one object alone, or the bare table, under many lights, in the OSF format.
@@ -95,7 +95,7 @@ def collect_object(config: CollectObject, library: AssetLibrary) -> Iterator[Pro
         UnknownName, MissingAssets: if the object is not in the library.
         InvalidInput: if a number is out of range or the folder is not empty.
     """
-    check_object(library, config.name)
+    library.check(config.name)
     mesh = TracedMesh(library.load(config.name).mesh)
     tracer = RayTracer({config.name: mesh})
     # The cone that touches the sphere has half-angle asin(radius / distance).

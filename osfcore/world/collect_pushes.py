@@ -425,11 +425,10 @@ def _simulate(
 
 @functools.lru_cache(maxsize=2)
 def _tabletop(
-    root: Path, objects: int, names: tuple[str, ...] | None, renderer: Renderer, view: tuple[FrameCamera, int]
+    root: Path, objects: int, names: tuple[str, ...] | None, renderer: Renderer, name: FrameCamera, size: int
 ) -> Tabletop:
     """Make one simulator per process and setting: its meshes stay loaded from episode to episode."""
     request = SceneRequest(count=objects, among=names)
-    name, size = view
     camera = goal_camera(size) if name == "goal" else default_cameras(size)[0]
     return Tabletop(AssetLibrary(root), cameras=(camera,), request=request, renderer=renderer)
 
@@ -437,7 +436,7 @@ def _tabletop(
 def _run_episode(config: CollectPushes, root: Path, index: int) -> PushEpisode:
     """Simulate one episode, which depends on nothing but the settings and its index."""
     seed = stream_seed(config.seed, Stream.COLLECTED_SCENE, index)
-    world = _tabletop(root, config.objects, config.names, config.renderer, (config.camera, config.size))
+    world = _tabletop(root, config.objects, config.names, config.renderer, config.camera, config.size)
     world.arrange(seed)
     if config.random_lights:
         lights = stream_rng(config.seed, Stream.COLLECTED_LIGHT, index)

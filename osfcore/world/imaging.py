@@ -691,10 +691,10 @@ def _near_bodies(shot: Shot) -> Bool[np.ndarray, "h w"]:
         if box is None:
             continue
         left, top, right, bottom = box
-        if min(height, width) < _SMALL_SIDE:
-            on_body[top : bottom + 1, left : right + 1] = True
-            continue
         corners = on_body[top : bottom + 1, left : right + 1]
+        if min(height, width) < _SMALL_SIDE:
+            corners[:] = True
+            continue
         directions = shot.directions(_grid(left, top, right + 1, bottom + 1))
         origins = np.broadcast_to(shot.origin, directions.shape)
         corners |= body.mesh.occludes(*into_frame(body.pose, origins, directions)).reshape(corners.shape)

@@ -198,9 +198,7 @@ class Physics:
         The pusher stops at the border of its reach, |x| and |y| of `PUSHER_REACH_M`.
         """
         start = self._pusher_position
-        goal = start + velocity * TIME_STEP_S
-        reach = np.maximum(PUSHER_REACH_M, np.abs(start[:2]))
-        goal[:2] = np.clip(goal[:2], -reach, reach)
+        goal = reached(start, velocity * TIME_STEP_S)
         self._hold_pusher((goal - start) / TIME_STEP_S + [0, 0, GRAVITY_M_S2 * TIME_STEP_S])
         self._bullet.stepSimulation()
         self._pusher_position = goal
@@ -246,6 +244,14 @@ class Physics:
         points = self._bullet.getClosestPoints(self._uids[first], self._uids[second], _REACH_M)
         nearest = min(points, key=lambda point: point[8], default=None)
         return (_REACH_M, np.array([0.0, 0.0, 1.0])) if nearest is None else (nearest[8], np.array(nearest[7]))
+
+
+def reached(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Return where the pusher is after a way from a start [m]: it stops at the border of its reach."""
+    reach = np.maximum(PUSHER_REACH_M, np.abs(start[:2]))
+    goal = start + way
+    goal[:2] = np.clip(goal[:2], -reach, reach)
+    return goal
 
 
 def mass_properties(parts: tuple[Float[np.ndarray, "_ 3"], ...], mass_kg: float) -> tuple[Pose, Float[np.ndarray, "3"]]:

@@ -38,17 +38,6 @@ class SceneRequest:
     among: tuple[str, ...] | None = None
 
 
-def check_object(library: AssetLibrary, name: str) -> None:
-    """Check that an object's mesh is on this machine.
-
-    Raises:
-        UnknownName: if the catalogue does not know it.
-        MissingAssets: if its mesh has not been fetched.
-        CorruptFile: if its files are damaged.
-    """
-    library.check(name)
-
-
 def check_request(library: AssetLibrary, request: SceneRequest) -> None:
     """Check that a request can be met.
 
@@ -59,12 +48,12 @@ def check_request(library: AssetLibrary, request: SceneRequest) -> None:
         check_ranges(("number of objects", len(request.names), 1, MAX_OBJECTS))
         check_unique("list of objects", request.names)
         for name in request.names:
-            check_object(library, name)
+            library.check(name)
         return
     check_ranges(("number of objects", request.count, 1, MAX_OBJECTS))
     choice = library.names() if request.among is None else request.among
     for name in request.among or ():
-        check_object(library, name)
+        library.check(name)
     check_unique("list of objects", choice)
     if request.among is None and not choice:
         raise OsfError("There are no objects on this machine yet; get them with 'osf assets fetch'.")

@@ -11,9 +11,9 @@ from osfcore.errors import InvalidInput
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
+from osfcore.geometry.workspace import STEP_S
 from osfcore.objects.asset import ObjectAsset
-from osfcore.world.physics import SUBSTEPS, Physics, body_model
+from osfcore.world.physics import SUBSTEPS, Physics, body_model, reached
 from osfcore.world.scenes import is_calm
 
 _SPARE_M = 0.003  # beyond its way: so far the pusher must meet nothing for an action to be skipped
@@ -51,12 +51,10 @@ class SimulatedPushes:
         """
         actions = check_actions(actions)
         futures = [self._follow(state, sequence) for sequence in actions]
-        positions, quaternions, pusher = (np.stack(parts) for parts in zip(*futures, strict=True))
-        return Rollouts(state.names, positions, quaternions, pusher)
+        poses = Pose.stacked(poses for poses, _ in futures)
+        return Rollouts(state.names, poses.position, poses.quaternion, np.stack([pusher for _, pusher in futures]))
 
-    def _follow(
-        self, state: SceneState, actions: Float[np.ndarray, "T 3"]
-    ) -> tuple[Float[np.ndarray, "T1 N 3"], Float[np.ndarray, "T1 N 4"], Float[np.ndarray, "T1 3"]]:
+    def _follow(self, state: SceneState, actions: Float[np.ndarray, "T 3"]) -> tuple[Pose, Float[np.ndarray, "T1 3"]]:
         if state.pusher is None:
             raise InvalidInput("pusher of the state", "missing", "there")
         for n, name in enumerate(state.names):
@@ -71,7 +69,7 @@ class SimulatedPushes:
                     self._physics.step(action)
                 poses.append(Pose.stacked(self._physics.pose(name) for name in state.names))
             pusher.append(self._physics.pusher)
-        return np.stack([p.position for p in poses]), np.stack([p.quaternion for p in poses]), np.stack(pusher)
+        return Pose.stacked(poses), np.stack(pusher)
 
     def _walks_past(self, names: tuple[str, ...], action: Float[np.ndarray, "3"]) -> bool:
         """Move the pusher alone if it meets nothing on its way; return whether it did."""
@@ -82,8 +80,5 @@ class SimulatedPushes:
         far = float(np.linalg.norm(way)) + _SPARE_M
         if any(physics.distance(name, None, far + _SPARE_M) < far for name in names):
             return False
-        reach = np.maximum(PUSHER_REACH_M, np.abs(physics.pusher[:2]))
-        place = physics.pusher + way
-        place[:2] = np.clip(place[:2], -reach, reach)
-        physics.place_pusher(place)
+        physics.place_pusher(reached(physics.pusher, way))
         return True

@@ -29,7 +29,6 @@ from osfcore.world.physics import SUBSTEPS, TIME_STEP_S, BodyModel, Physics, bod
 from osfcore.world.scenes import (
     Conditions,
     SceneRequest,
-    check_object,
     check_place,
     check_request,
     is_calm,
@@ -179,7 +178,7 @@ class Tabletop:
             OverlappingObjects: if bodies penetrate by more than 2 mm; then the table is as before.
         """
         for name in state.names:
-            check_object(self._library, name)
+            self._library.check(name)
             check_place(name, state.pose(name).position)
         before = self.truth() if self._physics else None
         self._place_all(state)
@@ -215,7 +214,7 @@ class Tabletop:
             UnknownName, MissingAssets: if an object is not in the library.
         """
         for name in state.names:
-            check_object(self._library, name)
+            self._library.check(name)
         self._place_all(state)
         self._steps = 0
 

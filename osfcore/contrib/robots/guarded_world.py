@@ -157,13 +157,6 @@ class GuardedWorld:
             self.stop("it was let go")
         self._world.close()
 
-    def _take_place(self, pusher: Float[np.ndarray, "3"] | None) -> None:
-        """Compare the place that the robot says if the robot may have been moved since the one before."""
-        if pusher is None or self._where is None or not self._is_started or self._stopped.is_set():
-            self._locate(pusher)
-        else:
-            self._compare(pusher, self._where)
-
     def _locate(self, pusher: Float[np.ndarray, "3"] | None) -> None:
         """Take the pusher to be where the robot says."""
         self._where, self._unmoved_m = None if pusher is None else Whereabouts.at(pusher), 0.0
@@ -174,12 +167,16 @@ class GuardedWorld:
         self._seen_at, self._way_m = pusher[:2].astype(float), 0.0
         self._asked = self._wished = np.zeros(2)
 
-    def _compare(self, pusher: Float[np.ndarray, "3"], where: Whereabouts) -> None:
+    def _take_place(self, pusher: Float[np.ndarray, "3"] | None) -> None:
         """Compare the place that the robot says with what was asked; stop the robot if they contradict each other.
 
         Raises:
             RobotStopped: if they do.
         """
+        where = self._where
+        if pusher is None or where is None or not self._is_started or self._stopped.is_set():
+            self._locate(pusher)  # there is nothing to compare
+            return
         off_m = where.distance_m(pusher[:2])
         if off_m > _PLACE_ERROR_M + _OVERSHOT_SHARE * self._way_m:
             off = f"its pusher is {1000 * off_m:.0f} mm away from where it was asked to go"
@@ -270,12 +267,11 @@ class OutlinedWorld:
             allowed = "around each object in at least one camera, for the robot delivers no masks"
             raise InvalidInput("boxes", "missing", allowed)
         marked = without_cameras(seen, unmarked)
-        pictures = [to_uint8(srgb_of_linear(image)) for image in marked.images]
-        pairs = zip(marked.cameras, pictures, strict=True)
         found = []
-        for camera, picture in pairs:  # a click in a box's middle marks the object, and background of the others
+        for camera, image in zip(marked.cameras, marked.images, strict=True):
             boxes = self._boxes[camera.name]
+            # A click in a box's middle marks the object, and background of the others.
             clicks = {name: np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]) for name, (x0, y0, x1, y1) in boxes.items()}
-            masks_of = propose_masks(picture, boxes, clicks)
+            masks_of = propose_masks(to_uint8(srgb_of_linear(image)), boxes, clicks)
             found.append([masks_of[name] for name in seen.names])
         return replace(marked, masks=np.array(found))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -41,6 +40,7 @@ from osfcore.photo.read_photograph import read_photograph
 # From encoded pictures of a robot's cameras to linear radiance of moderate size, as an `Observation` holds it.
 
 KEPT_SIDE = 640  # larger pictures are reduced to this; estimates look at less
+HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV and ROS have pixel centres at whole numbers
 _DETAIL_CHARACTERS = 300  # of a robot's reason for a refusal
 
 
@@ -94,10 +94,8 @@ class SentCamera:
         Raises:
             CorruptFile, InvalidInput: as `radiance`.
         """
-        return (
-            self._resample(read_photograph(picture, most_pixels=MOST_SIDE**2).eight_bit[..., 0].astype(np.float32))
-            > 127
-        )
+        values = read_photograph(picture, most_pixels=MOST_SIDE**2).eight_bit[..., 0]
+        return self._resample(values.astype(np.float32)) > 127
 
     def _resample(self, image: np.ndarray) -> np.ndarray:
         """Undistort an image and reduce it to the size of `kept`."""
@@ -106,8 +104,7 @@ class SentCamera:
             given = f"{image.shape[1]} x {image.shape[0]}"
             raise InvalidInput(what, given, f"{self.width} x {self.height}, as the robot says")
         if any(self.distortion):
-            K = self.intrinsics - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV's pixel centres are whole
-            image = cv2.undistort(image, K, np.array(self.distortion))
+            image = cv2.undistort(image, self.intrinsics - HALF_PIXEL, np.array(self.distortion))
         kept = self.kept()
         size = (kept.width, kept.height)
         return image if size == (self.width, self.height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -186,7 +183,7 @@ class HttpRobot:
         # Timeouts of a synchronous client begin anew with every byte, so whoever sends few of them holds it for ever.
         # Requests run in an event loop instead, where a time limits each as a whole.
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._run_loop, name="robot over HTTP", daemon=True)
+        self._thread = threading.Thread(target=self._loop.run_forever, name="robot over HTTP", daemon=True)
         self._thread.start()
         # Names of proxies in the environment are not for a robot beside the computer. What is not compressed is no
         # larger than it seems. A connection is given up before a robot would close it just as a motion is sent.
@@ -227,10 +224,8 @@ class HttpRobot:
         sent = None
         if masks and self.description.masks.issuperset(self._names):
             keys = [(camera.name, name) for camera in self._cameras for name in self._names]
-            sent = {
-                key: self._answer("GET", "masks/" + "/".join(map(_quoted, key)), most=MOST_PICTURE_BYTES)
-                for key in keys
-            }
+            paths = {(camera, name): f"masks/{_quoted(camera)}/{_quoted(name)}" for camera, name in keys}
+            sent = {key: self._answer("GET", path, most=MOST_PICTURE_BYTES) for key, path in paths.items()}
         seconds = time.monotonic() - self._began
         return observation_of(self._cameras, pictures, self._names, np.array(pusher), seconds, sent)
 
@@ -276,10 +271,7 @@ class HttpRobot:
         asyncio.run_coroutine_threadsafe(self._http.aclose(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
-
-    def _run_loop(self) -> None:
-        with contextlib.closing(self._loop):
-            self._loop.run_forever()
+        self._loop.close()
 
     def _json(self, path: str) -> Any:  # noqa: ANN401
         try:

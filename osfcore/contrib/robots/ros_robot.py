@@ -19,7 +19,7 @@ from pydantic import Field, FiniteFloat
 from websockets.exceptions import ConnectionClosed, InvalidURI, WebSocketException
 from websockets.sync.client import connect
 
-from osfcore.contrib.robots.http_robot import SentCamera, observation_of
+from osfcore.contrib.robots.http_robot import HALF_PIXEL, SentCamera, observation_of
 from osfcore.contrib.robots.robot import (
     ANSWER_S,
     MOST_JSON_BYTES,
@@ -259,7 +259,6 @@ _PICTURES_EVERY_MS = 50
 _FRESH = 2  # pictures to wait for: the first may have been exposed before it was asked for
 _MOVING, _TRANSFORMS_KEPT = "/tf", 200
 _TRANSFORMS = ("/tf_static", _MOVING)
-_HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # ROS has pixel centres at whole numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -418,7 +417,7 @@ class RosRobot:
         tree = self._complete_tree([*(info.header.frame_id for info in infos.values()), self._topics.pusher])
         described = []
         for camera, info in infos.items():
-            pose, K = tree.pose(info.header.frame_id, self._topics.table), np.reshape(info.k, (3, 3)) + _HALF_PIXEL
+            pose, K = tree.pose(info.header.frame_id, self._topics.table), np.reshape(info.k, (3, 3)) + HALF_PIXEL
             described.append(SentCamera(camera, pose, K, info.width, info.height, tuple(info.d)))
         return tuple(described)
 

@@ -273,15 +273,13 @@ def measure_cells(
     found = dict(zip(unique, results, strict=True))
     measured = []
     for section, own in zip(sections, pieces, strict=True):
-        first: tuple[EvaluateMpc, MpcReport] | None = None
-        cells = []
+        cells: list[MeasuredCell] = []
         for (label, config), parts in zip(section.cells, own, strict=True):
             report = episodes_report(config, [found[piece.cache.folder, piece.name] for piece in parts])
             against = None
-            if first is not None and _tasks_of(first[0]) == _tasks_of(config):
-                against = paired(report.shipped, first[1].shipped)
+            if cells and _tasks_of(section.cells[0].config) == _tasks_of(config):
+                against = paired(report.shipped, cells[0].report.shipped)
             cells.append(MeasuredCell(label, report, figures_of(config, report), against))
-            first = first or (config, report)
         measured.append(MeasuredSection(section, tuple(cells)))
     return measured
 
@@ -375,7 +373,7 @@ def _success_chart(section: MeasuredSection) -> Chart:
     if first.report.oracle:
         kinds["told the truth"] = first.report.told_truth
     curves = [_curve(name, scores) for name, scores in kinds.items()]
-    return Chart(objects_in_words(first.figures["objects"]), _DISTANCE, _SHARE, curves)
+    return Chart(_objects(first), _DISTANCE, _SHARE, curves)
 
 
 def _curve(name: str, scores: Sequence[RearrangementScore]) -> Curve:
