@@ -7,6 +7,7 @@ import { setUpCameras, showFrames } from "./cameras.js";
 import { setUpClip } from "./clip.js";
 import { setUpCompose } from "./compose.js";
 import { setUpCrop } from "./crop.js";
+import { refreshDamaged } from "./damaged.js";
 import { byId } from "./dom.js";
 import { setUpDriver } from "./driver.js";
 import { setUpDrop } from "./drop.js";
@@ -123,6 +124,7 @@ refreshObjects();
 refreshSets();
 refreshGoals();
 refreshPhotos();
+refreshDamaged();
 
 listen(VISITOR, {
   open(again) {
@@ -138,6 +140,7 @@ listen(VISITOR, {
       refreshSets();
       refreshGoals();
       refreshPhotos();
+      refreshDamaged();
       refreshSettings();
       refreshEpisodes();
       refreshShown();

@@ -23,6 +23,8 @@ IS_DRAWN = """name => {
 def url(library, tmp_path_factory):
     data_dir = tmp_path_factory.mktemp("data")
     shutil.copytree(library.root, data_dir / "objects")
+    (data_dir / "goals" / "half").mkdir(parents=True)
+    (data_dir / "goals" / "half" / "goal.json").write_text('{"name": "Half of a')
     with live_service(data_dir) as url:
         yield url
 
@@ -99,3 +101,15 @@ def test_a_thumbnail_turns_under_the_pointer_and_stands_still_where_motion_is_un
         tile.hover()
         assert tile.locator("img").evaluate("image => getComputedStyle(image).animationName") == expected
         page.close()
+
+
+def test_what_is_damaged_is_listed_with_a_reason_and_can_be_deleted(page, url):
+    entry = page.locator("#damaged-list li")
+    entry.wait_for(timeout=WAIT_MS)
+    assert "Goal" in entry.inner_text()
+    assert "JSON" in entry.inner_text()
+    for _ in range(2):  # it asks twice
+        entry.locator("button").click()
+    page.wait_for_selector("#damaged", state="hidden", timeout=WAIT_MS)
+    with urllib.request.urlopen(f"{url}/api/goals") as answer:
+        assert json.load(answer)["damaged"] == []
