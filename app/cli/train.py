@@ -178,7 +178,7 @@ class TrainDynamicsCommand(DataCommand):
 
 
 @dataclass(frozen=True)
-class TrainFitVidCommand(Command):
+class TrainFitVidCommand(DataCommand):
     """FitVid, which predicts video, to compare with. A killed training goes on when started again."""
 
     data: tuple[Path, ...]
@@ -197,6 +197,8 @@ class TrainFitVidCommand(Command):
     """Frames of a window, of which two are given."""
     rate: float = 1e-3
     """Of learning."""
+    warm_up: int = 200
+    """Steps over which the rate rises from nothing."""
     beta: float = 1e-4
     """Weight of the KL divergence."""
     augment: bool = True
@@ -214,7 +216,7 @@ class TrainFitVidCommand(Command):
         """Train with a progress bar; the result holds the metrics."""
         from osfcore.experiments.rivals.train_fitvid import TrainFitVid, train_fitvid
 
-        follow(train_fitvid(options_as(TrainFitVid, self)))
+        follow(train_fitvid(options_as(TrainFitVid, self), self.assets))
         metrics = _metrics(self.out)
         for horizon, means in metrics["horizons"].items():
             psnr = f"{means['psnr']:.1f} dB (the last known frame, copied: {means['psnr_copied']:.1f} dB)"

@@ -12,8 +12,8 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass, fields
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -28,12 +28,17 @@ from osfcore.dynamics.train import has_held_out_pair, is_for_validation
 from osfcore.errors import CorruptFile, InvalidInput, check_ranges, check_seed
 from osfcore.experiments.rivals.fitvid import CONTEXT, FitVidModel, FitVidSettings, write_fitvid
 from osfcore.fields.devices import pick_device
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M
 from osfcore.io.checkpoint import resume_from, write_checkpoint
 from osfcore.io.files import write_json
 from osfcore.io.output_paths import check_weights_place
 from osfcore.metrics.image_errors import MOST_DB
+from osfcore.objects.asset_library import AssetLibrary
 from osfcore.progress import Progress
 from osfcore.random_streams import Stream, stream_rng, stream_seed
+from osfcore.world.scenes import SceneRequest
+from osfcore.world.tabletop import Tabletop
 
 # Variations of videos while FitVid learns: a random crop and one random change of colours, the same for all frames.
 #
@@ -124,11 +129,13 @@ class Video(NamedTuple):
         path: of the file.
         group: of the episode.
         steps: its actions.
+        names: of its objects.
     """
 
     path: Path
     group: Any
     steps: int
+    names: tuple[str, ...]
 
     def read(self, start: int, steps: int) -> tuple[UInt8[np.ndarray, "T1 h w 3"], Float32[np.ndarray, "T 3"]]:
         """Read a stretch of the episode.
@@ -190,11 +197,11 @@ class VideoFiles:
                 frames, steps = group["frames"], len(group["actions"])
                 _check_shapes(path, frames, group["actions"].shape)
                 sizes.add(frames.shape[1:])
-                names = [name.decode() for name in group["names"][()].tolist()]
+                names = tuple(name.decode() for name in group["names"][()].tolist())
                 if is_for_validation(number):
-                    self.held_out.append(Video(path, group, steps))
+                    self.held_out.append(Video(path, group, steps, names))
                 elif not has_held_out_pair(names):
-                    self.learned.append(Video(path, group, steps))
+                    self.learned.append(Video(path, group, steps, names))
         except CorruptFile:
             raise
         except _ERRORS as error:
@@ -325,6 +332,54 @@ def _errors(images: Sequence[Tensor], truths: Sequence[Tensor]) -> Float[np.ndar
     return np.stack([error.cpu().numpy().astype(float) for error in errors], axis=1)
 
 
+# How much actions matter: a network that ignores them predicts the same after opposite pushes.
+
+
+_PUSHED_STEPS, _PUSHED_M_S = 10, 0.1
+_CLEARANCE_M = 0.02  # between pusher and object before the push
+
+
+def action_effect(
+    model: FitVidModel, library: AssetLibrary, names: Sequence[str], scenes: int = 12, seed: int = 0
+) -> dict[str, float]:
+    """Measure by how much the tenth frames after two opposite pushes differ, as predicted and in truth.
+
+    In each scene the pusher stands beside one object, under a random light, and is driven through it or away from it.
+
+    Args:
+        model: in evaluation mode.
+        library: meshes of the objects.
+        names: of the objects, one of which is drawn for each scene.
+        scenes: over which means are taken.
+        seed: of the scenes.
+
+    Returns:
+        Means over pixels, colours and scenes of the absolute difference "predicted" and "true" [0 to 1].
+    """
+    camera, predicted, true = (goal_camera(model.settings.side),), [], []
+    with closing(Tabletop(library, request=SceneRequest(count=1, among=tuple(names)))) as world:
+        for number in range(scenes):
+            rng = stream_rng(seed, Stream.VIDEO_SCENE, number)
+            world.arrange(int(rng.integers(2**31)))
+            start, angle = world.truth(), rng.uniform(0, 2 * np.pi)
+            way = np.array([np.cos(angle), np.sin(angle), 0.0])
+            gap = np.hypot(*library.size_m(start.names[0])[:2]) / 2 + PUSHER_RADIUS_M + _CLEARANCE_M
+            place = start.poses.position[0] - gap * way
+            start = replace(start, pusher=np.array([*place[:2], PUSHER_CENTRE_Z_M]))
+            pushes = np.tile(_PUSHED_M_S * way, (2, _PUSHED_STEPS, 1)) * np.array([1, -1])[:, None, None]
+            world.restore(start)
+            before, ends = world.render(camera).images[0], []
+            for actions in pushes:
+                world.restore(start)
+                for action in actions:
+                    world.act(action)
+                ends.append(world.render(camera).images[0])
+            futures = model.predict(np.stack([before, before]), pushes)[:, -1]
+            predicted.append(float(np.abs(futures[0] - futures[1]).mean()))
+            true.append(float(np.abs(ends[0] - ends[1]).mean()))
+    return {"predicted": round(float(np.mean(predicted)), 6), "true": round(float(np.mean(true)), 6)}
+
+
 _CLIP = 100.0
 _FALLING = 0.2  # of the budget
 _RECENT = 0.9  # share of running means that is kept from step to step
@@ -345,6 +400,7 @@ class TrainFitVid:
         batch: windows in each step.
         frames: of a window, context included.
         rate: of learning.
+        warm_up: steps over which the rate rises from nothing.
         beta: weight of the KL divergence.
         augment: whether videos are varied.
         precision: what convolutions compute in while training.
@@ -362,6 +418,7 @@ class TrainFitVid:
     batch: int = 8
     frames: int = 12
     rate: float = 1e-3
+    warm_up: int = 200
     beta: float = 1e-4
     augment: bool = True
     precision: Precision = "bfloat16"
@@ -383,8 +440,12 @@ class TrainFitVid:
         return shlex.join(parts)
 
 
-def train_fitvid(config: TrainFitVid) -> Iterator[Progress]:
+def train_fitvid(config: TrainFitVid, library: AssetLibrary | None = None) -> Iterator[Progress]:
     """Train a network and write it; a killed run goes on from its last checkpoint.
+
+    Args:
+        config: what to learn from, and how.
+        library: meshes of the objects, for `action_effect` in the metrics, which is null without.
 
     Yields:
         Seconds of the budget (or steps).
@@ -405,6 +466,7 @@ def train_fitvid(config: TrainFitVid) -> Iterator[Progress]:
         ("batch", config.batch, 1, 10_000),
         ("frames of a window", config.frames, CONTEXT + 1, 1000),
         ("rate of learning", config.rate, 1e-9, 1),
+        ("steps of warm-up", config.warm_up, 0, 1_000_000),
         ("beta", config.beta, 0, 1e6),
         ("steps between checkpoints", config.save_every, 1, 1_000_000),
         ("held-out videos", config.measured, 1, 1_000_000),
@@ -421,7 +483,7 @@ def train_fitvid(config: TrainFitVid) -> Iterator[Progress]:
                 run.save()
             yield run.progress(note)
         run.save()  # a kill while it measures repeats no step
-        yield from run.finish()
+        yield from run.finish(library)
 
 
 class _Run:
@@ -464,13 +526,14 @@ class _Run:
         self._adam.zero_grad(set_to_none=True)
         (losses.squared_error + config.beta * losses.kl).backward()
         norm = torch.nn.utils.clip_grad_norm_(self._model.parameters(), _CLIP)
+        rising = (self.steps + 1) / max(config.warm_up, 1)
         for group in self._adam.param_groups:
-            group["lr"] = config.rate * min(1.0, max((1 - self.share) / _FALLING, 1e-3))
+            group["lr"] = config.rate * min(1.0, rising, max((1 - self.share) / _FALLING, 1e-3))
         if torch.isfinite(norm):  # else this step would spoil all that follow
             self._adam.step()
         error, kl = (float(loss.detach()) / (config.frames - 1) for loss in losses)
         still = float((frames[:, CONTEXT:] - frames[:, CONTEXT - 1 : CONTEXT]).square().mean())
-        for name, value in {"error": error, "kl": kl, "still": still}.items():
+        for name, value in {"error": error, "kl": kl, "still": still, "norm": float(norm)}.items():
             self._recent[name] = value + _RECENT * (self._recent.get(name, value) - value)
         self.steps += 1
         self._spent_s += time.monotonic() - began
@@ -501,7 +564,7 @@ class _Run:
         self._adam.load_state_dict(content["adam"])
         self.steps, self._spent_s, self._recent = content["steps"], content["spent_s"], content["recent"]
 
-    def finish(self) -> Iterator[Progress]:
+    def finish(self, library: AssetLibrary | None) -> Iterator[Progress]:
         """Measure on held-out videos, and write weights and metrics."""
         model, videos = self._model.eval(), self._videos.held_out[: self._config.measured]
         errors = None
@@ -510,6 +573,8 @@ class _Run:
         assert errors is not None  # for the type checker: there are held-out videos
         report = errors.report()
         write_fitvid(self._config.out, model)
+        names = sorted({name for video in self._videos.learned for name in video.names})
+        there = [] if library is None else [name for name in names if library.has(name)]
         own = {
             "command": self._config.command,
             "seed": self._config.seed,
@@ -524,6 +589,8 @@ class _Run:
             "training_mse": round(self._recent.get("error", 0.0), 7),
             "training_mse_copied": round(self._recent.get("still", 0.0), 7),
             "training_kl": round(self._recent.get("kl", 0.0), 4),
+            "gradient_norm": round(self._recent.get("norm", 0.0), 4),
+            "action_effect": action_effect(model, library, there) if library is not None and there else None,
         }
         write_json(self._config.out.with_suffix(".json"), {**own, **report})
         self._checkpoint.unlink(missing_ok=True)

@@ -48,6 +48,8 @@ def test_a_run_writes_a_network_and_its_metrics(data, tmp_path):
     assert metrics["parameters"] == read_fitvid(settings.out).parameter_count
     assert metrics["horizons"]["5"]["psnr_copied"] > 10
     assert len(metrics["steps"]) == 5
+    assert metrics["gradient_norm"] > 0
+    assert metrics["action_effect"] is None  # nobody has given it the objects
     assert {p.name for p in tmp_path.iterdir()} == {"net.safetensors", "net.json"}  # no checkpoint is left
 
 
@@ -67,6 +69,27 @@ def test_an_abandoned_run_goes_on_and_ends_as_a_whole_one(data, tmp_path):
     assert [s.done for s in training.train_fitvid(parts)][:3] == [1, 2, 3]
     a, b = (load(one.out.read_bytes()) for one in (whole, parts))
     assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+class Obedient:
+    """Predicts that the picture is as bright as the pusher is fast, or that nothing changes."""
+
+    settings = FitVidSettings(16)
+
+    def __init__(self, obeys):
+        self._obeys = obeys
+
+    def predict(self, context, actions):
+        speed = np.linalg.norm(actions.sum(axis=1), axis=-1) * np.sign(actions.sum(axis=(1, 2)))
+        future = np.broadcast_to(context[-1], (*actions.shape[:2], *context.shape[1:]))
+        return future + self._obeys * speed[:, None, None, None, None]
+
+
+def test_what_actions_change_is_measured_beside_what_they_change_in_truth(library):
+    ignored, obeyed = (training.action_effect(Obedient(obeys), library, library.names(), scenes=2) for obeys in (0, 1))
+    assert ignored["predicted"] == 0
+    assert obeyed["predicted"] == pytest.approx(2.0)  # ten actions of 0.1 m/s one way, and the other
+    assert ignored["true"] == obeyed["true"] > 0.005
 
 
 @pytest.mark.parametrize("damage", ["other settings", "cut short"])
