@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,17 @@ def python(place, built):
 
 def test_both_are_built(built):
     assert sorted(path.name.partition("-")[2] for path in built.iterdir()) == ["0.1.0-py3-none-any.whl", "0.1.0.tar.gz"]
+
+
+def test_weights_of_rivals_stay_in_the_repository(built, python, place):
+    (wheel,) = built.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert any(name.startswith("osfcore/fields/shipped/") for name in names)
+    assert not any(name.startswith("osfcore/experiments/rivals/shipped/") for name in names)
+    program = "from osfcore.experiments.rivals.fitvid import fitvid_path; fitvid_path(None)"
+    told = run(python, "-c", program, cwd=place, check=False).stderr
+    assert "OsfError" in told
+    assert "DATA_DIR/fitvid.safetensors" in told
 
 
 @pytest.mark.parametrize(("name", "words"), [("estimate", "light: 0."), ("plan", "after 12 actions")])

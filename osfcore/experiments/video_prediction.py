@@ -140,7 +140,9 @@ def compare_videos(
             raise InvalidInput("image size [px]", config.size, f"{side}, as FitVid's network has")
     names = config.names or ()
     ours = network_path(config.data_dir)
-    paths = {"ours": ours, "nerf": ours, "paper": weights_path(config.data_dir), "fitvid": fitvid_path(config.data_dir)}
+    paths = {"ours": ours, "nerf": ours, "paper": weights_path(config.data_dir)}
+    if "fitvid" in config.methods:
+        paths["fitvid"] = fitvid_path(config.data_dir)
     networks = {method: [file_sha256(paths[method])] for method in config.methods if method in paths}
 
     def piece(method: str, number: int) -> Piece:

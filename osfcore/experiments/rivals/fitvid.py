@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
-from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,6 +35,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from osfcore.errors import CorruptFile, InvalidInput, check_ranges, shown
+from osfcore.experiments.rivals import repository_weights
 from osfcore.geometry.workspace import MAX_SPEED_M_S
 from osfcore.io.checkpoint import read_parameters
 from osfcore.io.files import write_atomically
@@ -515,10 +515,13 @@ _FILE = "fitvid.safetensors"
 
 
 def fitvid_path(data_dir: Path | None) -> Path:
-    """Return the file of the network: DATA_DIR/fitvid.safetensors if it is there, else the package's."""
+    """Return the file of the network: DATA_DIR/fitvid.safetensors if it is there, else the repository's.
+
+    Raises:
+        OsfError: if neither is there.
+    """
     own = None if data_dir is None else data_dir / _FILE
-    shipped = Path(str(files("osfcore.experiments.rivals") / "shipped" / _FILE))
-    return own if own is not None and own.is_file() else shipped
+    return own if own is not None and own.is_file() else repository_weights(_FILE, f"DATA_DIR/{_FILE}")
 
 
 def write_fitvid(path: Path, model: FitVidModel) -> None:

@@ -23,6 +23,7 @@ from jaxtyping import Bool
 
 from osfcore.control.estimators import SceneModels
 from osfcore.estimation.objective import ObjectModels
+from osfcore.experiments.rivals import repository_weights
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
@@ -75,9 +76,15 @@ def mean_table(table: TableField) -> TableField:
 
 
 def nerf_library(data_dir: Path | None) -> FieldLibrary:
-    """Return the fields without light: DATA_DIR/nerf/fields/NAME/field.safetensors, and those of the package."""
-    shipped = Path(str(files("osfcore.experiments.rivals") / "shipped" / "nerf"))
-    return FieldLibrary(None if data_dir is None else data_dir / _FOLDER, shipped=shipped)
+    """Return the fields without light: DATA_DIR/nerf/fields/NAME/field.safetensors, and those of the repository.
+
+    Raises:
+        OsfError: if neither are there.
+    """
+    own = None if data_dir is None else data_dir / _FOLDER
+    if own is not None and (own / "fields").is_dir():
+        return FieldLibrary(own, shipped=Path(str(files("osfcore.experiments.rivals") / "shipped" / "nerf")))
+    return FieldLibrary(own, shipped=repository_weights("nerf", f"DATA_DIR/{_FOLDER}/fields"))
 
 
 def load_nerf_appearance(names: Iterable[str], fields: FieldLibrary, data_dir: Path | None) -> ObjectModels:
