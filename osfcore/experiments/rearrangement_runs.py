@@ -272,12 +272,15 @@ def run_from_images(
     """
     variant = variant or Variant()
     cameras = default_cameras()[: variant.views]
-    with contextlib.closing(VariedWorld(assets, factor or Factor(), rng.spawn(1)[0], cameras=cameras)) as world:
+    with contextlib.ExitStack() as stack:
+        varied = VariedWorld(assets, factor or Factor(), rng.spawn(1)[0], cameras=cameras)
+        world = stack.enter_context(contextlib.closing(varied))
         goal = world.goal_image(task.goal, goal_camera())
         world.restore(task.start)
         models, estimators = parts.models, parts.estimators
         if "dynamics" in variant.truths:
-            models = replace(models, dynamics=SimulatedModel(assets, tuple(models.shapes)))
+            simulated = stack.enter_context(contextlib.closing(SimulatedModel(assets, tuple(models.shapes))))
+            models = replace(models, dynamics=simulated)
         if "poses" in variant.truths:
             estimators = TrueEstimators(estimators.first, estimators.later, estimators.goal, truth=world.truth)
         if variant.published("planning"):
