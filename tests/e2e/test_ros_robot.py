@@ -97,4 +97,4 @@ def test_it_is_driven_with_boxes_that_are_drawn_in_its_pictures(page, robot):
     assert "somebody pressed Stop" in page.inner_text("#robot-note")
     count = len(stand_in.twists)
     page.wait_for_timeout(500)
-    assert len(stand_in.twists) == count
+    assert not np.any(stand_in.twists[count:])  # the job, when it ends, may say once more that it shall stand
