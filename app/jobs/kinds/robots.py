@@ -61,7 +61,7 @@ class RobotParams(JobParams):
 
     Attributes:
         url: of the robot.
-        title: what the goal is called.
+        title: what the goal is called; None in jobs of earlier versions.
         names: of the objects.
         goal_camera: the name of the robot's camera that took the goal photo.
         boxes: by camera and object, its bounding box in the first images [px].
@@ -72,7 +72,7 @@ class RobotParams(JobParams):
     """
 
     url: str
-    title: str
+    title: str | None = None
     names: tuple[str, ...]
     goal_camera: str
     boxes: dict[str, dict[str, tuple[float, float, float, float]]]

@@ -4,7 +4,7 @@ from typing import get_args
 import pytest
 
 from app.jobs.job import Job, State, check_file_name, ended, job_fields, job_from_fields
-from app.jobs.kinds import KINDS
+from app.jobs.kinds import KINDS, check_stored
 from app.jobs.kinds.collections import CollectPushesParams
 from app.jobs.registry import WrongJobState
 from osfcore.errors import InvalidInput, UnknownName
@@ -14,6 +14,23 @@ from tests.support.errors import about
 def test_a_job_survives_json():
     job = Job("a", "collect_table", {"images": 60}, files=("x.zip",), result={"n": 1}, eta_s=1.5)
     assert job_from_fields(json.loads(json.dumps(job_fields(job)))) == job
+
+
+NESTED = {"steps": 5, "plan": {"samples": 9}}
+BEFORE = {  # what earlier versions stored
+    "episode": {"scene": "s", "names": ["box"], "seed": 0, "settings": NESTED, "method": "ours", "goal": {"id": None}},
+    "estimate": {"mode": "first", "seed": 0, "names": ["box"], "cameras": ["0"], "of": {"scene": "s", "revision": 1}},
+    "train_field": {"name": "box", "source": {"mesh": "box", "set": None}, "minutes": 1, "seed": 0, "images": 60},
+    "robot": {
+        "url": "http://robot", "names": ["box"], "goal_camera": "0", "boxes": {"0": {"box": [1, 2, 3, 4]}}, "seed": 0,
+        "settings": NESTED, "box": [-0.3, -0.3, 0.3, 0.3], "top_speed_m_s": 0.2,
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", BEFORE)
+def test_jobs_of_earlier_versions_are_read_and_what_later_ones_add_is_left_out(kind):
+    check_stored(Job("a", kind, {**BEFORE[kind], "added": 1}))
 
 
 @pytest.mark.parametrize("state", get_args(State))
