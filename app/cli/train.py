@@ -95,7 +95,7 @@ class TrainFieldCommand(Command):
         from osfcore.fields.train_osf import FieldSettings
         from osfcore.paper.train_fields import train_paper_field
 
-        _refuse_with_paper(hollow=self.hollow, recipe=self.recipe != "direct")
+        _refuse("with --method paper, which has no such thing", hollow=self.hollow, recipe=self.recipe != "direct")
         return [options_as(FieldSettings, self, data=data, out=out) for data, out in places], train_paper_field
 
 
@@ -146,6 +146,10 @@ class TrainDynamicsCommand(DataCommand):
     """Of ours: windows in each (default 96)."""
     rate: float | None = None
     """Of learning, at its highest (ours 0.004, paper 0.001)."""
+    propagations: int | None = None
+    """Of the paper's: steps of propagation (default 3)."""
+    weight_decay: float | None = None
+    """Of the paper's: decay of weights by AdamW (default 0.5)."""
     device: Device = "auto"
     seed: Seed = 0
 
@@ -161,6 +165,11 @@ class TrainDynamicsCommand(DataCommand):
         from osfcore.dynamics.rollout import load_shapes
         from osfcore.dynamics.train import TrainDynamics, train_dynamics
 
+        _refuse(
+            "without --method paper",
+            propagations=self.propagations is not None,
+            weight_decay=self.weight_decay is not None,
+        )
         config = options_as(TrainDynamics, self)
         return train_dynamics(config, load_shapes(self.data_dir, self.trained, self.trained.names()))
 
@@ -168,7 +177,8 @@ class TrainDynamicsCommand(DataCommand):
         from osfcore.paper.dynamics import longest_axes
         from osfcore.paper.train_dynamics import TrainPaperDynamics, train_paper_dynamics
 
-        _refuse_with_paper(
+        _refuse(
+            "with --method paper, which has no such thing",
             long_iterations=self.long_iterations is not None,
             long_batch=self.long_batch is not None,
             without=bool(self.without),
@@ -224,12 +234,11 @@ class TrainFitVidCommand(DataCommand):
         return {"out": str(self.out), **metrics}
 
 
-def _refuse_with_paper(**given: bool) -> None:
-    """Refuse options that were given and that the paper's method does not have."""
+def _refuse(when: str, **given: bool) -> None:
+    """Refuse options that were given but mean nothing then, such as "with --method paper"."""
     for name, is_given in given.items():
         if is_given:
-            option = f"option --{name.replace('_', '-')}"
-            raise InvalidInput(option, "given", "left out with --method paper, which has no such thing")
+            raise InvalidInput(f"option --{name.replace('_', '-')}", "given", f"left out {when}")
 
 
 def _metrics(out: Path) -> dict[str, Any]:

@@ -228,6 +228,8 @@ def _shapes(episode: PushEpisode) -> dict[str, tuple[int, ...]]:
     if episode.sub_positions is not None and episode.sub_quaternions is not None:
         instants = episode.sub_positions.shape[1] if episode.sub_positions.ndim > 1 else 0
         shapes |= {"sub_positions": (steps, instants, count, 3), "sub_quaternions": (steps, instants, count, 4)}
+    if episode.frames is not None:
+        shapes["frames"] = (steps + 1, *episode.frames.shape[1:3], 3)
     if episode.disturbed is not None:
         rows = len(np.atleast_1d(episode.disturbed.step))
         shapes |= {_PREFIX + name: (rows, count, 4 if "quaternions" in name else 3) for name in _DISTURBED}
@@ -239,8 +241,7 @@ def _write_group(group: h5py.Group, episode: PushEpisode) -> None:
     group.attrs["seed"] = episode.seed
     group.create_dataset("names", data=list(episode.names), dtype=h5py.string_dtype())
     for name, array in _arrays(episode).items():
-        chunks = (1, *array.shape[1:]) if name == "frames" else True  # whoever learns from frames reads a few at a time
-        group.create_dataset(name, data=array, compression="gzip", shuffle=True, chunks=chunks)
+        group.create_dataset(name, data=array, compression="gzip", shuffle=True)
 
 
 def _read_group(group: h5py.Group) -> PushEpisode:

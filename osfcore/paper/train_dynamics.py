@@ -198,7 +198,6 @@ def _errors(network: GraphNetwork, pieces: Windows) -> Float[Tensor, "four B N"]
 # The training run.
 
 
-_DECAY = 0.5  # of weights
 _MEASURE_EVERY = 500  # iterations
 
 
@@ -212,7 +211,9 @@ class TrainPaperDynamics:
         iterations: steps of descent, at most.
         batch: windows of three actions in each.
         hidden: width of the network.
+        propagations: L, steps of propagation.
         rate: of learning, at its highest.
+        weight_decay: of AdamW.
         patience: measurements on held-out episodes without a better one after which training stops.
         device: "auto", "cpu" or "cuda".
         seed: of everything random.
@@ -223,7 +224,9 @@ class TrainPaperDynamics:
     iterations: int = 2_000
     batch: int = 256
     hidden: int = 128
+    propagations: int = 3
     rate: float = 1e-3
+    weight_decay: float = 0.5
     patience: int = 12
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
@@ -231,8 +234,8 @@ class TrainPaperDynamics:
     @property
     def command(self) -> str:
         """How to do it again."""
-        options = ("iterations", "batch", "hidden", "rate", "patience", "seed")
-        return shlex.join(command_of(self, options, "--method", "paper"))
+        choices = ("hidden", "propagations", "rate", "weight_decay", "patience", "seed")
+        return shlex.join(command_of(self, ("iterations", "batch", *choices), "--method", "paper"))
 
 
 def train_paper_dynamics(config: TrainPaperDynamics, kappas: Mapping[str, float]) -> Iterator[Progress]:
@@ -247,7 +250,9 @@ def train_paper_dynamics(config: TrainPaperDynamics, kappas: Mapping[str, float]
         CorruptFile: if a push file cannot be read, or the checkpoint of a killed run cannot be gone on from.
         CannotWrite: if the output cannot be written, which is tried first.
     """
-    device = prepare(config)
+    device = prepare(
+        config, ("steps of propagation", config.propagations, 1, 100), ("weight decay", config.weight_decay, 0, 1000)
+    )
     yield Progress(0, config.iterations, "Reading the pushes")
     yield from _Run(config, kappas, device).run()
 
@@ -262,8 +267,10 @@ class _Run(PushTraining):
         self._episodes = len(learned)
         names = sorted({name for episode in learned for name in episode.names})
         torch.manual_seed(config.seed)
-        self._network = GraphNetwork(names, config.hidden).to(device)
-        self._optimiser = torch.optim.AdamW(self._network.parameters(), lr=config.rate, weight_decay=_DECAY)
+        self._network = GraphNetwork(names, config.hidden, config.propagations).to(device)
+        self._optimiser = torch.optim.AdamW(
+            self._network.parameters(), lr=config.rate, weight_decay=config.weight_decay
+        )
         self._recording = record(learned, self._network, kappas, UNROLLED)
         self._validation = record(kept, self._network, kappas, MEASURED_WINDOW)
         super().__init__(

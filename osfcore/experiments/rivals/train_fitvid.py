@@ -9,15 +9,15 @@ as of the paper's random ones; as for our dynamics, episodes with a held-out pai
 
 from __future__ import annotations
 
+import math
 import shlex
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import h5py
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int, UInt8
@@ -33,6 +33,7 @@ from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_RADIUS_M
 from osfcore.io.checkpoint import resume_from, write_checkpoint
 from osfcore.io.files import write_json
 from osfcore.io.output_paths import check_weights_place
+from osfcore.io.push_file import PushEpisode, read_sound_pushes
 from osfcore.metrics.image_errors import MOST_DB
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.progress import Progress
@@ -103,68 +104,28 @@ def _grey(video: Frames) -> Float[Tensor, "T 1 h w"]:
     return (video * video.new_tensor(_GREY)[:, None, None]).sum(dim=1, keepdim=True)
 
 
-# Frames and actions of recorded pushes, read window by window: thousands of videos need not fit into memory.
+# Recorded pushes as videos.
 
 
 LEAST_STEPS = 2  # of an episode: two frames of context, and one to predict
-_ERRORS = (OSError, KeyError, TypeError, ValueError, AttributeError)
 
 
-class Windows(NamedTuple):
-    """B stretches of T actions.
+class Video(NamedTuple):
+    """An episode of T actions.
 
     Attributes:
         frames: before the first and after each action.
         actions: [m/s].
-    """
-
-    frames: UInt8[np.ndarray, "B T1 h w 3"]
-    actions: Float32[np.ndarray, "B T 3"]
-
-
-class Video(NamedTuple):
-    """An episode in its file.
-
-    Attributes:
-        path: of the file.
-        group: of the episode.
-        steps: its actions.
         names: of its objects.
     """
 
-    path: Path
-    group: Any
-    steps: int
+    frames: UInt8[Tensor, "T1 h w 3"]
+    actions: Float32[Tensor, "T 3"]
     names: tuple[str, ...]
 
-    def read(self, start: int, steps: int) -> tuple[UInt8[np.ndarray, "T1 h w 3"], Float32[np.ndarray, "T 3"]]:
-        """Read a stretch of the episode.
 
-        Raises:
-            CorruptFile: if it cannot be read.
-        """
-        try:
-            frames = self.group["frames"][start : start + steps + 1]
-            actions = self.group["actions"][start : start + steps]
-        except _ERRORS as error:
-            raise CorruptFile(self.path, f"an episode in it cannot be read ({error})") from error
-        if not np.all(np.isfinite(actions)):
-            raise CorruptFile(self.path, "actions of an episode are not finite")
-        return frames, actions.astype(np.float32)
-
-
-class VideoFiles:
-    """The episodes of push files with frames, to be used as a context.
-
-    As for dynamics, one episode in twelve of each file is held out, and so is every other one in which a pair of
-    objects meets that shall not be learned from.
-
-    Args:
-        paths: of the files.
-
-    Raises:
-        CorruptFile: if one is no push file, or has no frames.
-        InvalidInput: if frames differ in size between files, or nothing is left to learn from or to measure on.
+class Videos(NamedTuple):
+    """What there is to learn from, and to measure on.
 
     Attributes:
         side: of the frames [px].
@@ -172,91 +133,99 @@ class VideoFiles:
         held_out: episodes to measure on.
     """
 
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self.learned: list[Video] = []
-        self.held_out: list[Video] = []
-        sizes: set[tuple[int, ...]] = set()
-        with ExitStack() as opened:
-            for path in paths:
-                self._open(path, opened, sizes)
-            if len(sizes) > 1:
-                raise InvalidInput("sizes of the frames [px]", [size[:2] for size in sizes], "the same in all files")
-            for what, videos in (("learn from", self.learned), ("measure on", self.held_out)):
-                if not videos:
-                    raise InvalidInput(f"episodes with frames to {what}", 0, "at least 1: collect more")
-            self._opened = opened.pop_all()
-        self.side = next(iter(sizes))[0]
-
-    def _open(self, path: Path, opened: ExitStack, sizes: set[tuple[int, ...]]) -> None:
-        """Open a file, note the size of its frames and which of its episodes are held out."""
-        try:
-            file: Any = opened.enter_context(h5py.File(path))
-            for number, (_, group) in enumerate(sorted(file.items())):
-                if "frames" not in group:
-                    raise CorruptFile(path, "it holds no frames: 'osf collect pushes --images' keeps them")
-                frames, steps = group["frames"], len(group["actions"])
-                _check_shapes(path, frames, group["actions"].shape)
-                sizes.add(frames.shape[1:])
-                names = tuple(name.decode() for name in group["names"][()].tolist())
-                if is_for_validation(number):
-                    self.held_out.append(Video(path, group, steps, names))
-                elif not has_held_out_pair(names):
-                    self.learned.append(Video(path, group, steps, names))
-        except CorruptFile:
-            raise
-        except _ERRORS as error:
-            raise CorruptFile(path, f"it is not a push file ({error})") from error
-
-    def __enter__(self) -> VideoFiles:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._opened.close()
-
-    def drawn(self, rng: np.random.Generator, count: int, steps: int) -> Windows:
-        """Draw random stretches of random episodes to learn from.
-
-        Args:
-            rng: draws them.
-            count: of them.
-            steps: actions in each.
-
-        Raises:
-            InvalidInput: if no episode is so long.
-            CorruptFile: if an episode cannot be read.
-        """
-        long = [video for video in self.learned if video.steps >= steps]
-        if not long:
-            longest = max(video.steps for video in self.learned)
-            raise InvalidInput("frames of a window", steps + 1, f"at most {longest + 1}, as the longest episode has")
-        chosen = rng.integers(len(long), size=count)
-        starts = rng.integers([long[n].steps - steps + 1 for n in chosen])
-        return windows([long[n] for n in chosen], starts, steps)
+    side: int
+    learned: list[Video]
+    held_out: list[Video]
 
 
-def _check_shapes(path: Path, frames: Any, actions: tuple[int, ...]) -> None:  # noqa: ANN401 - h5py's dataset
-    side = frames.shape[1] if frames.ndim == 4 else 0
-    if frames.dtype != np.uint8 or frames.shape != (actions[0] + 1, side, side, 3):
+def read_videos(paths: Sequence[Path], device: torch.device | str = "cpu") -> Videos:
+    """Read push files with frames: at 128 pixels a thousand episodes of 50 actions take 2.5 GB of memory.
+
+    As for dynamics, one episode in twelve of each file is held out, and so is every other one in which a pair of
+    objects meets that shall not be learned from.
+
+    Args:
+        paths: of the files.
+        device: that holds frames and actions.
+
+    Raises:
+        CorruptFile: if one is no push file, or has no frames.
+        InvalidInput: if frames differ in size between files, or nothing is left to learn from or to measure on.
+    """
+    learned: list[Video] = []
+    held_out: list[Video] = []
+    for path in paths:
+        for number, episode in enumerate(read_sound_pushes(path)):
+            if is_for_validation(number):
+                held_out.append(_video(path, episode, device))
+            elif not has_held_out_pair(episode.names):
+                learned.append(_video(path, episode, device))
+    sides = sorted({len(video.frames[0]) for video in (*learned, *held_out)})
+    if len(sides) > 1:
+        raise InvalidInput("sizes of the frames [px]", sides, "the same in all files")
+    for what, videos in (("learn from", learned), ("measure on", held_out)):
+        if not videos:
+            raise InvalidInput(f"episodes with frames to {what}", 0, "at least 1: collect more")
+    return Videos(sides[0], learned, held_out)
+
+
+def _video(path: Path, episode: PushEpisode, device: torch.device | str) -> Video:
+    frames = episode.frames
+    if frames is None:
+        raise CorruptFile(path, "it holds no frames: 'osf collect pushes --images' keeps them")
+    if frames.dtype != np.uint8 or frames.shape[1] != frames.shape[2]:
         raise CorruptFile(path, f"its frames are {frames.dtype} of shape {frames.shape}, not square 8-bit images")
-    if len(actions) != 2 or actions[1] != 3:
-        raise CorruptFile(path, f"its actions have shape {actions}, not (T, 3)")
-    if actions[0] < LEAST_STEPS:
-        raise CorruptFile(path, f"its episodes have {actions[0]} actions, but {LEAST_STEPS} are needed to predict any")
+    if len(episode.actions) < LEAST_STEPS:
+        few = f"its episodes have {len(episode.actions)} actions, but {LEAST_STEPS} are needed to predict any"
+        raise CorruptFile(path, few)
+    actions = torch.as_tensor(episode.actions, dtype=torch.float32)
+    return Video(torch.as_tensor(frames).to(device), actions.to(device), episode.names)
+
+
+class Windows(NamedTuple):
+    """B stretches of T actions.
+
+    Attributes:
+        frames: before the first and after each action, in [0, 1].
+        actions: [m/s].
+    """
+
+    frames: Float[Tensor, "B T1 3 h w"]
+    actions: Float32[Tensor, "B T 3"]
 
 
 def windows(videos: Sequence[Video], starts: Int[np.ndarray, "B"], steps: int) -> Windows:
-    """Read stretches of the same length.
+    """Return stretches of the same length as the network takes them.
 
     Args:
         videos: one episode for each stretch.
         starts: first action of each stretch.
         steps: actions in each.
+    """
+    chosen = list(zip(videos, starts.tolist(), strict=True))
+    frames = torch.stack([video.frames[start : start + steps + 1] for video, start in chosen])
+    actions = torch.stack([video.actions[start : start + steps] for video, start in chosen])
+    return Windows(frames.movedim(-1, 2).float() / 255, actions)
+
+
+def draw_windows(videos: Sequence[Video], rng: np.random.Generator, count: int, steps: int) -> Windows:
+    """Draw random stretches of random episodes.
+
+    Args:
+        videos: the episodes.
+        rng: draws them.
+        count: of them.
+        steps: actions in each.
 
     Raises:
-        CorruptFile: if an episode cannot be read.
+        InvalidInput: if no episode is so long.
     """
-    read = [video.read(int(start), steps) for video, start in zip(videos, starts, strict=True)]
-    return Windows(np.stack([frames for frames, _ in read]), np.stack([actions for _, actions in read]))
+    long = [video for video in videos if len(video.actions) >= steps]
+    if not long:
+        longest = max(len(video.actions) for video in videos)
+        raise InvalidInput("frames of a window", steps + 1, f"at most {longest + 1}, as the longest episode has")
+    chosen = [long[n] for n in rng.integers(len(long), size=count)]
+    return windows(chosen, rng.integers([len(video.actions) - steps + 1 for video in chosen]), steps)
 
 
 # How well held-out videos are predicted, step by step, against the last context frame, copied.
@@ -304,26 +273,17 @@ def measure(model: FitVidModel, videos: Sequence[Video]) -> Iterator[VideoErrors
         model: in evaluation mode.
         videos: as far as the longest horizon, or as the shortest of them goes.
 
-    Raises:
-        CorruptFile: if one cannot be read.
     """
-    steps = min(*(video.steps for video in videos), CONTEXT - 1 + max(HORIZONS))
-    device = next(model.parameters()).device
+    steps = min(*(len(video.actions) for video in videos), CONTEXT - 1 + max(HORIZONS))
     predicted, copied = [], []
     for first in range(0, len(videos), _AT_ONCE):
         some = videos[first : first + _AT_ONCE]
-        read = windows(some, np.zeros(len(some), int), steps)
-        frames = as_frames(read.frames, device)
-        futures = model.rollout(frames[:, :CONTEXT], torch.as_tensor(read.actions, device=device))
+        frames, actions = windows(some, np.zeros(len(some), int), steps)
+        futures = model.rollout(frames[:, :CONTEXT], actions)
         last, truths = frames[:, CONTEXT - 1], frames[:, CONTEXT:].unbind(dim=1)
         predicted.append(_errors(list(futures), truths))
         copied.append(_errors([last] * len(truths), truths))
         yield VideoErrors(np.concatenate(predicted), np.concatenate(copied))
-
-
-def as_frames(frames: np.ndarray, device: torch.device) -> Float[Tensor, "B T 3 h w"]:
-    """Return recorded 8-bit frames (B, T, h, w, 3) as the network takes them."""
-    return torch.as_tensor(frames, device=device).movedim(-1, 2).float() / 255
 
 
 def _errors(images: Sequence[Tensor], truths: Sequence[Tensor]) -> Float[np.ndarray, "B T"]:
@@ -473,23 +433,22 @@ def train_fitvid(config: TrainFitVid, library: AssetLibrary | None = None) -> It
     )
     device = pick_device(config.device)
     check_weights_place(config.out, _OWN_METRICS)
-    with VideoFiles(config.data) as videos:
-        run = _Run(config, videos, device)
-        run.resume()
-        yield run.progress("Reading the frames")
-        while run.share < 1:
-            note = run.iterate()
-            if run.steps % config.save_every == 0:
-                run.save()
-            yield run.progress(note)
-        run.save()  # a kill while it measures repeats no step
-        yield from run.finish(library)
+    run = _Run(config, read_videos(config.data, device), device)
+    run.resume()
+    yield run.progress("Reading the frames")
+    while run.share < 1:
+        note = run.iterate()
+        if run.steps % config.save_every == 0:
+            run.save()
+        yield run.progress(note)
+    run.save()  # a kill while it measures repeats no step
+    yield from run.finish(library)
 
 
 class _Run:
     """The state of a training run."""
 
-    def __init__(self, config: TrainFitVid, videos: VideoFiles, device: torch.device) -> None:
+    def __init__(self, config: TrainFitVid, videos: Videos, device: torch.device) -> None:
         self._config, self._videos, self._device = config, videos, device
         generator = torch.random.get_rng_state()
         torch.manual_seed(stream_seed(config.seed, Stream.VIDEO_WEIGHTS))
@@ -516,12 +475,10 @@ class _Run:
         """Do one step of descent. What is random in it depends on its number alone, not on the steps before it."""
         began, config = time.monotonic(), self._config
         rng = stream_rng(config.seed, Stream.VIDEO_WINDOWS, self.steps)
-        window = self._videos.drawn(rng, config.batch, config.frames - 1)
-        frames = as_frames(window.frames, self._device)
+        frames, actions = draw_windows(self._videos.learned, rng, config.batch, config.frames - 1)
         if config.augment:
             frames = augmented(frames, rng)
         latents = torch.Generator(self._device).manual_seed(int(rng.integers(2**62)))
-        actions = torch.as_tensor(window.actions, device=self._device)
         losses = self._model.losses(frames, actions, latents)
         self._adam.zero_grad(set_to_none=True)
         (losses.squared_error + config.beta * losses.kl).backward()
@@ -529,11 +486,13 @@ class _Run:
         rising = (self.steps + 1) / max(config.warm_up, 1)
         for group in self._adam.param_groups:
             group["lr"] = config.rate * min(1.0, rising, max((1 - self.share) / _FALLING, 1e-3))
-        if torch.isfinite(norm):  # else this step would spoil all that follow
+        still = (frames[:, CONTEXT:] - frames[:, CONTEXT - 1 : CONTEXT]).square().mean() * (config.frames - 1)
+        # one transfer from the device, for each waits until it has done the step
+        *sums, length = torch.stack([*losses, still, norm]).detach().tolist()
+        if math.isfinite(length):  # else this step would spoil all that follow
             self._adam.step()
-        error, kl = (float(loss.detach()) / (config.frames - 1) for loss in losses)
-        still = float((frames[:, CONTEXT:] - frames[:, CONTEXT - 1 : CONTEXT]).square().mean())
-        for name, value in {"error": error, "kl": kl, "still": still, "norm": float(norm)}.items():
+        means = (*(total / (config.frames - 1) for total in sums), length)
+        for name, value in zip(("error", "kl", "still", "norm"), means, strict=True):
             self._recent[name] = value + _RECENT * (self._recent.get(name, value) - value)
         self.steps += 1
         self._spent_s += time.monotonic() - began

@@ -169,34 +169,35 @@ def test_at_most_a_fifth_of_the_side_is_cropped():
 
 def test_windows_are_stretches_of_the_episodes(data):
     episodes = read_pushes(data)
-    with training.VideoFiles((data, data)) as files:
-        assert (files.side, len(files.learned), len(files.held_out)) == (16, 24, 4)
-        some = training.windows([files.held_out[0], files.held_out[1]], np.array([1, 2]), 3)
-        for n, (number, start) in enumerate(((0, 1), (12, 2))):
-            np.testing.assert_array_equal(some.frames[n], episodes[number].frames[start : start + 4])
-            np.testing.assert_allclose(some.actions[n], episodes[number].actions[start : start + 3], atol=1e-7)
-        drawn = files.drawn(np.random.default_rng(0), 9, 6)  # the whole of them
-        assert drawn.frames.shape == (9, 7, 16, 16, 3)
-        whole = {e.frames.tobytes() for n, e in enumerate(episodes) if n % 12}
-        assert {frames.tobytes() for frames in drawn.frames} <= whole
-        with pytest.raises(InvalidInput, check=about("frames of a window")):
-            files.drawn(np.random.default_rng(0), 1, 7)
+    videos = training.read_videos((data, data))
+    assert (videos.side, len(videos.learned), len(videos.held_out)) == (16, 24, 4)
+    some = training.windows(videos.held_out[:2], np.array([1, 2]), 3)
+    for n, (number, start) in enumerate(((0, 1), (12, 2))):
+        frames = episodes[number].frames[start : start + 4].transpose(0, 3, 1, 2)
+        np.testing.assert_allclose(255 * some.frames[n], frames, atol=1e-4)
+        np.testing.assert_allclose(some.actions[n], episodes[number].actions[start : start + 3], atol=1e-7)
+    drawn = training.draw_windows(videos.learned, np.random.default_rng(0), 9, 6)  # the whole of them
+    assert drawn.frames.shape == (9, 7, 3, 16, 16)
+    whole = [torch.as_tensor(e.actions, dtype=torch.float32) for n, e in enumerate(episodes) if n % 12]
+    assert all(any(torch.equal(actions, one) for one in whole) for actions in drawn.actions)
+    with pytest.raises(InvalidInput, check=about("frames of a window")):
+        training.draw_windows(videos.learned, np.random.default_rng(0), 1, 7)
 
 
 def test_files_without_frames_and_of_other_kinds_are_refused(data, tmp_path):
     with pytest.raises(CorruptFile, check=about("no frames")):
-        training.VideoFiles((write_videos(tmp_path / "plain.h5", count=2, with_frames=False),))
+        training.read_videos((write_videos(tmp_path / "plain.h5", count=2, with_frames=False),))
     with pytest.raises(CorruptFile, check=about("1 actions")):
-        training.VideoFiles((write_videos(tmp_path / "short.h5", count=2, steps=1),))
+        training.read_videos((write_videos(tmp_path / "short.h5", count=2, steps=1),))
     with pytest.raises(InvalidInput, check=about("sizes")):
-        training.VideoFiles((data, write_videos(tmp_path / "large.h5", side=32, count=2)))
+        training.read_videos((data, write_videos(tmp_path / "large.h5", side=32, count=2)))
     (tmp_path / "text.h5").write_text("not a push file")
     with pytest.raises(CorruptFile, check=about("text.h5")):
-        training.VideoFiles((tmp_path / "text.h5",))
+        training.read_videos((tmp_path / "text.h5",))
     never_meet = ("005_tomato_soup_can", "010_potted_meat_can")
     for name, more in (("one", {"count": 1}), ("pair", {"names": never_meet})):
         with pytest.raises(InvalidInput, check=about("learn from")):
-            training.VideoFiles((write_videos(tmp_path / f"{name}.h5", **more),))
+            training.read_videos((write_videos(tmp_path / f"{name}.h5", **more),))
 
 
 # Measurement
@@ -217,8 +218,7 @@ def test_means_are_of_each_horizon_and_of_each_frames_own_psnr():
 def test_predictions_are_compared_with_the_frames_after_the_context(data):
     torch.manual_seed(0)
     network = FitVidModel(FitVidSettings(side=16, width=1, features=6, hidden=8, latent=2)).eval()
-    with training.VideoFiles((data,)) as files:
-        (errors,) = training.measure(network, files.held_out)
+    (errors,) = training.measure(network, training.read_videos((data,)).held_out)
     assert errors.predicted.shape == (2, 5)
     for row, number in enumerate((0, 12)):
         episode = read_pushes(data)[number]
