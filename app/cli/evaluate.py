@@ -307,12 +307,15 @@ class EvaluateRelightingCommand(ParallelEvaluation):
     """Objects in a scene."""
     elevations: tuple[float, ...] = (5, 10, 20, 30, 45, 60, 75, 90)
     """Of the lights above the table [deg]."""
+    factor: str = ""
+    """One thing in which the world differs from what fields learned, such as objects_shiny or renderer_tiny."""
 
     def _steps(self, executor: Executor | None) -> Iterator[Any]:
         from osfcore.experiments.relighting import CompareRelighting, compare_relighting
 
         config = CompareRelighting(
-            self.folder, self.data_dir, self.names, self.tasks, self.seed, self.methods, self.objects, self.elevations
+            self.folder, self.data_dir, self.names, self.tasks, self.seed, self.methods, self.objects, self.elevations,
+            self.factor,
         )  # fmt: skip
         return compare_relighting(config, self.trained, self.assets, executor)
 

@@ -127,7 +127,7 @@ class Factor:
     """Difference of a world from the usual one; by default none.
 
     Attributes:
-        conditions: lamp, table and contacts.
+        conditions: lamp, table, contacts and what takes the pictures.
         has_wooden_table: the table is of wood, another one for each world.
         camera_turn_rad: by which every camera is turned, each about an axis of its own [rad].
         camera_shift_m: by which every camera is moved, each in a direction of its own [m].
@@ -218,6 +218,8 @@ FACTORS: Mapping[str, Factor] = MappingProxyType(
         "exposure_1.4": Factor(exposure=1.4),
         "ambient_0.6": _ambient(0.6),
         "table_dark": Factor(Conditions(table=TableSurface((0.20, 0.19, 0.17)))),
+        "objects_shiny": Factor(Conditions(lamp=Lamp(specular=0.4))),
+        "renderer_tiny": Factor(Conditions(renderer="tiny")),
         "mild_together": Factor(
             Conditions(lamp=Lamp(ambient=0.35, diffuse=0.65), table=TableSurface((0.50, 0.52, 0.53))),
             camera_turn_rad=float(np.deg2rad(0.15)),

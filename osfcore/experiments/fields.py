@@ -33,7 +33,6 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.kiloosf import KiloOSF, read_field
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, Camera, default_cameras, image_side
 from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import MAX_OBJECTS, SceneState
 from osfcore.inspection.contact_sheet import Comparison, contact_sheet
 from osfcore.io.image_file import to_uint8, write_png
@@ -43,8 +42,7 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import EXACT, Quality, Renderer, SceneBatch
 from osfcore.world.collect_images import MIN_IMAGES, CollectObject, collect_object
-from osfcore.world.imaging import RayTracer
-from osfcore.world.scenes import SceneRequest
+from osfcore.world.scenes import Conditions, SceneRequest
 from osfcore.world.tabletop import Tabletop
 from osfcore.world.tasks import Draw, draw_scene
 
@@ -150,7 +148,11 @@ def simulate(draw: Draw, library: AssetLibrary, cameras: tuple[Camera, ...]) -> 
 
 
 def simulate_relit(
-    draw: Draw, lights: Sequence[Light], library: AssetLibrary, cameras: tuple[Camera, ...]
+    draw: Draw,
+    lights: Sequence[Light],
+    library: AssetLibrary,
+    cameras: tuple[Camera, ...],
+    conditions: Conditions | None = None,
 ) -> tuple[Truth, ...]:
     """Take pictures of the same arrangement under one light after the other.
 
@@ -159,19 +161,19 @@ def simulate_relit(
         lights: to take pictures under.
         library: meshes of its objects.
         cameras: of one image size.
+        conditions: of the world; the usual ones if None.
 
     Raises:
         UnknownName, MissingAssets: if an object has no mesh here.
         NoRoom: if the objects do not fit side by side.
     """
-    nothing, truths = Pose(np.zeros((0, 3)), np.zeros((0, 4))), []
-    request = SceneRequest(names=draw.names, light=draw.light)
-    with closing(Tabletop(library, cameras=cameras, request=request)) as world:
+    truths, request = [], SceneRequest(names=draw.names, light=draw.light)
+    with closing(Tabletop(library, cameras=cameras, request=request, conditions=conditions)) as world:
         world.arrange(draw.seed)
         for light in lights:
             world.set_light(light)
             pictures = world.pictures(cameras, with_pusher=False)
-            empty = RayTracer({}).render(SceneState((), nothing, light, None), cameras)
+            empty = world.pictures(cameras, with_pusher=False, with_objects=False)
             objects = np.stack([picture.coverage.sum(axis=0) > 0 for picture in pictures])
             pairs = zip(empty, pictures, strict=True)
             darker = np.stack([np.any(lit.rgb - picture.rgb > _SHADE, axis=-1) for lit, picture in pairs])

@@ -18,6 +18,7 @@ from jaxtyping import UInt8
 
 from osfcore.errors import InvalidInput
 from osfcore.experiments.charts import Axis
+from osfcore.experiments.factors import factor_named
 from osfcore.experiments.fields import MEASURES, compare_scene, figures_of, render_scene, simulate_relit
 from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult
 from osfcore.experiments.images import (
@@ -50,9 +51,11 @@ class CompareRelighting(CompareImages):
 
     Attributes:
         elevations_deg: of the lights above the table.
+        factor: name of what differs from the usual world, such as "objects_shiny"; "" for nothing.
     """
 
     elevations_deg: tuple[float, ...] = ELEVATIONS_DEG
+    factor: str = ""
 
 
 def compare_relighting(
@@ -67,7 +70,7 @@ def compare_relighting(
         executor: works on scenes side by side, if given.
 
     Raises:
-        UnknownName, MissingAssets: if an object lacks a field or a mesh.
+        UnknownName, MissingAssets: if an object lacks a field or a mesh, or no factor has that name.
         InvalidInput: if a number is out of range, or objects are too few.
         NoRoom: if there is no room for a scene's objects.
         WorkerDied: if a worker process ended.
@@ -77,17 +80,20 @@ def compare_relighting(
     if not elevations or not MIN_LIGHT_ELEVATION_DEG <= elevations[0] <= elevations[-1] <= 90:
         allowed = f"one or more between {MIN_LIGHT_ELEVATION_DEG:g} and 90"
         raise InvalidInput("elevations of the light [deg]", ", ".join(f"{e:g}" for e in elevations) or "none", allowed)
+    if config.factor:
+        factor_named(config.factor)  # an unknown one is refused before any work
     config = checked(replace(config, elevations_deg=elevations), FIELD_METHODS, fields, assets)
     names = config.names or ()
 
     def piece(method: str, number: int) -> Piece:
-        cache = TaskCache(config.folder / "relighting" / f"{config.objects}-{config.seed}" / method)
+        cell = "-".join(part for part in (f"{config.objects}-{config.seed}", config.factor) if part)
+        cache = TaskCache(config.folder / "relighting" / cell / method)
         draw = draw_scene(names, config.objects, config.seed, number, Stream.RELIT_SCENE)
         shown = shown_circumstances(draw, (method,), fields, assets, config.data_dir, config.size)
-        given = {"version": VERSION, "elevations_deg": elevations, **shown}
+        given = {"version": VERSION, "elevations_deg": elevations, "factor": config.factor, **shown}
         return Piece(f"{number:04d}", cache, given, partial(show_relit, config, draw, method, fields, assets))
 
-    about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "size")}
+    about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "size", "factor")}
     spans = {ALL: range(len(elevations)), **{f"{elevation:g}": [n] for n, elevation in enumerate(elevations)}}
     yield from compare(
         config, piece, executor, files=(REPORT_FILE, CHART_FILE, IMAGES_FILE),
@@ -118,7 +124,8 @@ def show_relit(
     """
     azimuth = float(np.arctan2(draw.light.direction[1], draw.light.direction[0]))
     lights = [Light.from_angles(azimuth, np.deg2rad(elevation)) for elevation in config.elevations_deg]
-    truths = simulate_relit(draw, lights, assets, default_cameras(config.size))
+    conditions = factor_named(config.factor).conditions if config.factor else None
+    truths = simulate_relit(draw, lights, assets, default_cameras(config.size), conditions)
     renderer = load_appearance(method, draw.names, fields, config.data_dir).together
     scenes = [compare_scene(truth, render_scene(renderer, truth)) for truth in truths]
     figures = [figures_of(scene) for scene in scenes]

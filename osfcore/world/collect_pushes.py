@@ -36,8 +36,8 @@ from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng, stream_seed
 from osfcore.world.physics import TIME_STEP_S, BodyModel, Physics
-from osfcore.world.scenes import SceneRequest, check_request
-from osfcore.world.tabletop import Renderer, Tabletop
+from osfcore.world.scenes import Conditions, Renderer, SceneRequest, check_request
+from osfcore.world.tabletop import Tabletop
 
 # Substeps from disturbed states.
 #
@@ -430,7 +430,8 @@ def _tabletop(
     """Make one simulator per process and setting: its meshes stay loaded from episode to episode."""
     request = SceneRequest(count=objects, among=names)
     camera = goal_camera(size) if name == "goal" else default_cameras(size)[0]
-    return Tabletop(AssetLibrary(root), cameras=(camera,), request=request, renderer=renderer)
+    conditions = Conditions(renderer=renderer)
+    return Tabletop(AssetLibrary(root), cameras=(camera,), request=request, conditions=conditions)
 
 
 def _run_episode(config: CollectPushes, root: Path, index: int) -> PushEpisode:

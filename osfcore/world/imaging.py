@@ -26,7 +26,7 @@ from osfcore.objects.asset import TexturedMesh
 #     radiance = albedo * (ambient + diffuse * max(0, n . l) * visible),    visible in {0, 1},
 #
 # in linear values, no gamma. A near lamp has a place, a cone and falloff besides (`SpotLamp`). Lamps of another
-# strength or colour, and other tables, serve to measure methods that do not know of them.
+# strength or colour, shiny objects and other tables serve to measure methods that do not know of them.
 
 TABLE_ALBEDO = (0.66, 0.62, 0.56)  # pale wood, uniform, so that only light and shadow change it
 BACKGROUND_RADIANCE = (0.10, 0.11, 0.12)  # beyond the table's edge; no lamp reaches it
@@ -43,12 +43,14 @@ class Lamp:
         diffuse: what the light adds when it falls in along the normal.
         intensity: factor on both.
         colour: factors on both, of red, green and blue.
+        specular: what the light adds on an object, whatever its albedo, where it is mirrored toward the eye.
     """
 
     ambient: float = AMBIENT
     diffuse: float = DIFFUSE
     intensity: float = 1.0
     colour: tuple[float, float, float] = WHITE
+    specular: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -149,6 +151,30 @@ def lambert(
     irradiance = lamp.intensity * (lamp.ambient + lamp.diffuse * np.maximum(cosine, 0) * visible)
     radiance = albedo * irradiance[:, None]
     return radiance if lamp.colour == WHITE else radiance * np.array(lamp.colour, radiance.dtype)
+
+
+_SHININESS = 32.0  # exponent of highlights
+
+
+def highlight(
+    normals: Float[np.ndarray, "S 3"],
+    directions: Float[np.ndarray, "S 3"],
+    light: Float[np.ndarray, "3"],
+    visible: Float[np.ndarray, "S"],
+    lamp: Lamp,
+) -> Float[np.ndarray, "S 1"]:
+    """Compute what a distant light adds on shiny surfaces: specular * max(0, n . h)^32 (Blinn, 1977).
+
+    Args:
+        normals: unit, toward the eye.
+        directions: of rays from the eye, of any length.
+        light: unit vector toward the light.
+        visible: 1 where the light arrives, 0 in shadow.
+        lamp: its strength.
+    """
+    halfway = light - directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    cosine = np.einsum("ij,ij->i", normals, halfway) / np.maximum(np.linalg.norm(halfway, axis=1), 1e-9)
+    return (lamp.intensity * lamp.specular * visible * np.maximum(cosine, 0) ** _SHININESS)[:, None]
 
 
 # Rays and one textured mesh: intersection and occlusion by Embree, prefiltered texture lookup.
@@ -789,4 +815,7 @@ def _body_colour(
     visible = np.zeros(len(distance), np.float32)
     facing = np.nonzero(incidence > 0)[0]
     visible[facing] = shot.lit(points[facing] + _BIAS_M * normals[facing], index)
-    return lambert(albedo, incidence, visible, shot.lamp)
+    matte = lambert(albedo, incidence, visible, shot.lamp)
+    if shot.lamp.specular == 0 or shot.spot is not None:
+        return matte
+    return matte + highlight(normals, directions, shot.light, visible, shot.lamp)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -232,9 +233,12 @@ def _place_pusher(physics: Physics, names: tuple[str, ...], rng: np.random.Gener
 _MAX_FACTOR = 100.0
 
 
+Renderer = Literal["embree", "tiny"]
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Conditions:
-    """Light, table and contacts of a world; the defaults are those that the methods assume.
+    """Light, table, contacts and pictures of a world; the defaults are those that the methods assume.
 
     Attributes:
         lamp: how strongly, and in which colour, the scene is lit.
@@ -243,6 +247,8 @@ class Conditions:
             two objects it counts twice.
         mass_factor: on the mass and the moments of inertia of every object.
         spot: a near lamp in the place of the distant light; None for the distant light.
+        renderer: "embree" (exact shadows, anti-aliased) or "tiny" (PyBullet's TinyRenderer, as the paper used), which
+            has no other lamp and no other table.
     """
 
     lamp: Lamp = field(default_factory=Lamp)
@@ -250,13 +256,16 @@ class Conditions:
     friction_factor: float = 1.0
     mass_factor: float = 1.0
     spot: SpotLamp | None = None
+    renderer: Renderer = "embree"
 
     def __post_init__(self) -> None:
-        """Check the factors.
+        """Check the factors and the renderer.
 
         Raises:
-            InvalidInput: if one is not positive, or beyond reason.
+            InvalidInput: if a factor is not positive, or beyond reason, or there is no such renderer.
         """
+        if self.renderer not in ("embree", "tiny"):
+            raise InvalidInput("renderer", repr(self.renderer), '"embree" or "tiny"')
         for what, factor in (("factor on friction", self.friction_factor), ("factor on mass", self.mass_factor)):
             if not 0 < factor <= _MAX_FACTOR:
                 raise InvalidInput(what, factor, f"above 0 and at most {_MAX_FACTOR:g}")

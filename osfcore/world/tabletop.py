@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -38,7 +37,6 @@ from osfcore.world.scenes import (
 )
 from osfcore.world.tiny_renderer import TinyScene
 
-Renderer = Literal["embree", "tiny"]
 _SETTLE_LIMIT_S = 3.0
 
 
@@ -49,9 +47,8 @@ class Tabletop:
         library: where the objects' meshes are.
         cameras: what `observe` looks through.
         request: what `reset` puts on the table.
-        renderer: "embree" (exact shadows, anti-aliased) or "tiny" (PyBullet's TinyRenderer, as the paper used).
         executor: takes the views of an observation side by side, if given; threads serve.
-        conditions: lamp and table, which "tiny" leaves out, and contacts; the usual ones if None.
+        conditions: lamp, table, contacts and what takes the pictures; the usual ones if None.
 
     Attributes:
         cameras: what `observe` looks through.
@@ -67,17 +64,13 @@ class Tabletop:
         *,
         cameras: tuple[Camera, ...] | None = None,
         request: SceneRequest | None = None,
-        renderer: Renderer = "embree",
         executor: Executor | None = None,
         conditions: Conditions | None = None,
     ) -> None:
-        if renderer not in ("embree", "tiny"):
-            raise InvalidInput("renderer", repr(renderer), '"embree" or "tiny"')
         self.cameras = default_cameras() if cameras is None else cameras
         self._library = library
         self._request = SceneRequest() if request is None else request
         check_request(library, self._request)
-        self._renderer: Renderer = renderer
         self._executor = executor
         self._conditions = conditions or Conditions()
         self._assets: dict[str, ObjectAsset] = {}
@@ -314,10 +307,14 @@ class Tabletop:
             time_s=self.time_s,
         )
 
-    def pictures(self, cameras: tuple[Camera, ...], *, with_pusher: bool = True) -> tuple[Picture, ...]:
+    def pictures(
+        self, cameras: tuple[Camera, ...], *, with_pusher: bool = True, with_objects: bool = True
+    ) -> tuple[Picture, ...]:
         """Take images with coverage and depth, for evaluation."""
         state = self.truth() if with_pusher else replace(self.truth(), pusher=None)
-        if self._renderer == "tiny":
+        if not with_objects:
+            state = replace(state, names=(), poses=Pose(np.zeros((0, 3)), np.zeros((0, 4))))
+        if self._conditions.renderer == "tiny":
             if self._tiny is None:
                 self._tiny = TinyScene(self.assets)
             return self._tiny.render(state, cameras)
@@ -375,5 +372,8 @@ class WorldInputs:
 
 
 WORLDS: Mapping[str, Callable[[WorldInputs], SimulatedWorld]] = {
-    "simulated": lambda given: Tabletop(given.library, request=given.request)
+    "simulated": lambda given: Tabletop(given.library, request=given.request),
+    "tinyrenderer": lambda given: Tabletop(
+        given.library, request=given.request, conditions=Conditions(renderer="tiny")
+    ),
 }

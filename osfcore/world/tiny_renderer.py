@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -48,14 +49,13 @@ class TinyScene:
 
     def render(self, state: SceneState, cameras: tuple[Camera, ...]) -> tuple[Picture, ...]:
         """Draw a state; coverage is 0 or 1, for TinyRenderer does not smooth edges."""
-        for i, name in enumerate(state.names):
-            self._place(self._bodies[name], state.poses[i])
+        gone = Pose(np.array([0.0, 0.0, -100.0]), Pose.identity().quaternion)  # out of sight
+        for name, body in self._bodies.items():
+            self._place(body, state.pose(name) if name in state.names else gone)
         uids = [self._bodies[name] for name in state.names]
-        place = np.array([0.0, 0.0, -100.0])  # out of sight
         if state.pusher is not None:
-            place = state.pusher
             uids.append(self._pusher)
-        self._place(self._pusher, Pose(place, Pose.identity().quaternion))
+        self._place(self._pusher, gone if state.pusher is None else replace(gone, position=state.pusher))
         return tuple(self._picture(state, camera, uids) for camera in cameras)
 
     def _picture(self, state: SceneState, camera: Camera, uids: list[int]) -> Picture:

@@ -5,7 +5,7 @@ import cv2
 import pytest
 
 import osfcore.experiments.relighting as relit
-from osfcore.errors import InvalidInput
+from osfcore.errors import InvalidInput, UnknownName
 from osfcore.experiments.fields import MEASURES
 from osfcore.fields.field_library import FieldLibrary
 from tests.support.errors import about
@@ -61,6 +61,14 @@ def test_what_was_measured_is_taken_over(asked, steps, library, monkeypatch):
     assert len(simulated) == 1
 
 
+@pytest.mark.parametrize("factor", ["objects_shiny", "renderer_tiny"])
+def test_worlds_that_fields_do_not_know_are_shown_less_well(asked, steps, library, factor):
+    *_, last = relit.compare_relighting(replace(asked, factor=factor), FieldLibrary(None), library)
+    assert last.report["factor"] == factor
+    known, strange = (report["methods"]["ours"]["psnr"]["spans"]["all"] for report in (steps[-1].report, last.report))
+    assert strange["mean"] < known["mean"]
+
+
 def test_what_cannot_be_compared_is_refused(asked, library, tmp_path):
     changes = [("methods", ("magic",)), ("tasks", 0)]
     changes += [("elevations_deg", wrong) for wrong in ((), (3.0, 20.0), (91.0,))]
@@ -68,4 +76,8 @@ def test_what_cannot_be_compared_is_refused(asked, library, tmp_path):
         config = replace(asked, folder=tmp_path / "out", **{what: wrong})
         with pytest.raises(InvalidInput, check=about(what.removesuffix("_deg"))):
             next(relit.compare_relighting(config, FieldLibrary(None), library))
+    with pytest.raises(UnknownName):
+        next(
+            relit.compare_relighting(replace(asked, folder=tmp_path / "out", factor="fog"), FieldLibrary(None), library)
+        )
     assert not (tmp_path / "out").exists()

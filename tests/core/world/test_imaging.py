@@ -21,6 +21,7 @@ from osfcore.world.imaging import (
     RayTracer,
     TableSurface,
     TracedMesh,
+    highlight,
     lambert,
     masks_of,
     pusher_mesh,
@@ -203,6 +204,16 @@ def test_open_table_has_no_false_shadow_and_the_background_lies_beyond_it(elevat
         np.testing.assert_allclose(picture.rgb[inside], expected, atol=1e-5)
         assert np.isinf(picture.depth[0, 32])
         np.testing.assert_allclose(picture.rgb[0, 32], BACKGROUND_RADIANCE, atol=1e-6)
+
+
+def test_a_highlight_is_brightest_where_the_normal_halves_the_angle_from_light_to_eye():
+    """Around that normal it falls off by the cosine to the power of 32, and in shadow there is none."""
+    light, eye = np.array([0.6, 0, 0.8]), np.array([-0.6, 0, 0.8])
+    tilts = np.linspace(-0.5, 0.5, 11)
+    normals = np.stack([np.sin(tilts), np.zeros(11), np.cos(tilts)], axis=1)
+    found = highlight(normals, np.tile(-3 * eye, (11, 1)), light, np.ones(11), Lamp(intensity=2, specular=0.3))
+    np.testing.assert_allclose(found[:, 0], 0.6 * np.cos(tilts) ** 32, atol=1e-9)
+    assert not highlight(normals, np.tile(-eye, (11, 1)), light, np.zeros(11), Lamp(specular=0.3)).any()
 
 
 def test_pictures_are_linear_in_the_lamp_where_it_reaches():

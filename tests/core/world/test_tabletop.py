@@ -10,7 +10,7 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.world.imaging import masks_of
-from osfcore.world.scenes import SceneRequest
+from osfcore.world.scenes import Conditions, SceneRequest
 from osfcore.world.tabletop import Tabletop
 from tests.support.errors import about
 from tests.support.same import assert_same
@@ -192,7 +192,7 @@ def test_episodes_of_random_pushes_never_explode(tables, seeds):
 @pytest.mark.slow
 def test_tiny_renderer_sees_the_same_scene_as_ray_tracing(tables):
     cameras = (goal_camera(128), default_cameras(128)[1])
-    exact, tiny = tables(1), tables(renderer="tiny")
+    exact, tiny = tables(1), tables(conditions=Conditions(renderer="tiny"))
     tiny.load(exact.truth())
     for a, b in zip(exact.pictures(cameras), tiny.pictures(cameras), strict=True):
         mine, other = masks_of(a, 3), masks_of(b, 3)
