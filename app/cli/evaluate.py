@@ -180,6 +180,41 @@ class EvaluateEstimateCommand(ParallelEvaluation):
 
 
 @dataclass(frozen=True)
+class EvaluatePublishedCommand(ParallelEvaluation):
+    """First frames by the estimation as published, under the choices that the paper's text leaves open."""
+
+    objects: int = 3
+    """Objects in a scene."""
+    fields: Literal["paper", "ours"] = "paper"
+    """Whose appearance is compared with the images; ours take a seventh of the time."""
+    settings: tuple[str, ...] = ()
+    """Some of the settings, such as '24 starts'; all by default."""
+    families: tuple[Literal["any", "upright"], ...] = ("any", "upright")
+    """How objects lie: in any resting orientation, or all of them upright."""
+
+    def _steps(self, executor: Executor | None) -> Iterator[Any]:
+        from osfcore.experiments.paper_estimation import SETTINGS, EvaluatePaperEstimation, evaluate_paper_estimation
+
+        config = EvaluatePaperEstimation(
+            self.folder / "published", self.data_dir, self.names, self.tasks, self.seed, self.objects,
+            self.settings or tuple(SETTINGS), self.families, self.fields,
+        )  # fmt: skip
+        return evaluate_paper_estimation(config, self.trained, self.assets, executor)
+
+    def _show(self, report: dict[str, Any]) -> None:
+        for family, rows in report["families"].items():
+            print(f"Objects {'upright' if family == 'upright' else 'in any resting orientation'}:")
+            shown = [
+                (name, _percent(row["share"]), _number(row["mm_median"]), _number(row["deg_median"]),
+                 _number(row["light_deg_median"]), _percent(row["eq5_prefers_wrong"]), _number(row["seconds_median"]))
+                for name, row in rows.items()
+            ]  # fmt: skip
+            titles = ("setting", "1 cm, 10 deg", "mm", "deg", "light deg", "eq. 5 prefers wrong", "s")
+            show_table(shown, titles, left=("setting",))
+        print(f"Figures: {self.folder / 'published'}")
+
+
+@dataclass(frozen=True)
 class EvaluateDynamicsCommand(ParallelEvaluation):
     """Predicted pushes of two to six objects against the simulator, a quasi-static model and the constant pose.
 
@@ -218,8 +253,9 @@ class EvaluateDynamicsCommand(ParallelEvaluation):
 class EvaluateMpcCommand(ParallelEvaluation):
     """Episodes: tables that shall become what a goal image shows; the same planner given the truth; no action."""
 
-    family: Literal["shifted", "turned", "crowded", "relit"] = "shifted"
-    """What goals ask for: objects elsewhere; turned as well; in one another's places; photographed in another light."""
+    family: Literal["shifted", "turned", "crowded", "relit", "upright"] = "shifted"
+    """What goals ask for: objects elsewhere; turned as well; in one another's places; photographed in another light;
+    elsewhere, all of them upright."""
     objects: int = 3
     """Objects in a scene, 1 to 6."""
     actions: int = 30
@@ -463,6 +499,7 @@ class ReproduceCommand(DataCommand):
 Evaluate = choice_of(
     fields=EvaluateFieldsCommand,
     estimate=EvaluateEstimateCommand,
+    published=EvaluatePublishedCommand,
     dynamics=EvaluateDynamicsCommand,
     mpc=EvaluateMpcCommand,
     relighting=EvaluateRelightingCommand,

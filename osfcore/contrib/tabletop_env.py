@@ -80,7 +80,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         data_dir: whose `objects` are used; the program's own if None.
         names: objects to choose from; all that are there if None.
         objects: in each scene (N).
-        family: of the tasks: "shifted", "turned", "crowded" or "relit".
+        family: of the tasks: "shifted", "turned", "crowded", "relit" or "upright".
         obs: what is observed: "poses", "pixels" or "both".
         image_side: of observed images [px].
         render_mode: "rgb_array" or None.

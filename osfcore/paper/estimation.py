@@ -11,12 +11,12 @@ gradients, no rivals, no predictions, no doubts.
 Choices where the paper says nothing: positions begin at the masks' centroids, triangulated, and orientations upright;
 the first five iterations have a population large enough to find an orientation; populations, iterations and standard
 deviations are chosen so that an estimate takes about as long as ours; images are compared at half their resolution,
-rendered as coarsely as our estimation renders them.
+rendered as coarsely as our estimation renders them. `osfcore.experiments.paper_estimation` measures other choices.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,7 +41,7 @@ class PaperEstimationConfig:
     """How much work an estimate is.
 
     Attributes:
-        masked_iterations: of each object in its masks, the light overhead (the paper's five).
+        masked_iterations: of each search for an object in its masks (the paper's five).
         masked_population: candidates in each.
         joint_iterations: of all poses and the light.
         joint_population: candidates in each.
@@ -50,6 +50,10 @@ class PaperEstimationConfig:
         masked_spread: initial standard deviations in the masks: positions [m], quaternions' numbers.
         joint_spread: of positions [m], quaternions' numbers, light [m] when these poses are refined together.
         later_spread: of positions and quaternions' numbers in later frames, where the light is held.
+        rounds: how often the first frame is searched in the masks and as a whole; after the first time eq. 5 has the
+            light that was found, not the one overhead.
+        converged: overall step of CMA-ES, 1 at the beginning, below which a search of the first frame ends early.
+        side: of the images that are compared [px].
     """
 
     masked_iterations: int = 5
@@ -61,10 +65,17 @@ class PaperEstimationConfig:
     masked_spread: tuple[float, float] = (0.02, 1.0)
     joint_spread: tuple[float, float, float] = (0.01, 0.15, 0.5)
     later_spread: tuple[float, float] = (0.01, 0.1)
+    rounds: int = 1
+    converged: float = 0.0
+    side: int = FINE_SIDE // 2
 
 
 def estimate_first(
-    models: ObjectModels, observation: Observation, rng: np.random.Generator, config: PaperEstimationConfig
+    models: ObjectModels,
+    observation: Observation,
+    rng: np.random.Generator,
+    config: PaperEstimationConfig,
+    starts: Mapping[str, Float[np.ndarray, "K 4"]] | None = None,
 ) -> Iterator[EstimateStep]:
     """Find all poses and the light; the last step holds the estimate.
 
@@ -73,6 +84,8 @@ def estimate_first(
         observation: one or more views with masks.
         rng: of the searches.
         config: how much work to do.
+        starts: orientations of each object from which searches in its masks begin, the best of which counts; upright
+            alone if None.
 
     Raises:
         InvalidInput: without masks, or if an object's masks are all empty.
@@ -81,28 +94,58 @@ def estimate_first(
     models.check(observation.names)
     if observation.masks is None:
         raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
-    views, names = views_of(observation, FINE_SIDE // 2), observation.names
-    starts = np.array([_triangulated(observation, observation.masks[:, n], n) for n in range(len(names))]).reshape(
-        -1, 3
-    )
-    upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(names), 1))
-    params = SceneParameters(names, starts, upright, np.array(OVERHEAD), observation.pusher)
-    reporter = StepReporter(config.masked_iterations + config.joint_iterations + 1)
+    views, names = views_of(observation, config.side), observation.names
+    masks = [observation.masks[:, n] for n in range(len(names))]
+    places = np.array([_triangulated(observation, mask, n) for n, mask in enumerate(masks)]).reshape(-1, 3)
+    upright = np.array([[1.0, 0.0, 0.0, 0.0]])
+    turned = [upright if starts is None else starts[name] for name in names]
+    best = SceneParameters(names, places, np.tile(upright, (len(names), 1)), np.array(OVERHEAD), observation.pusher)
+    reporter = StepReporter(config.rounds * (config.masked_iterations + config.joint_iterations) + 1)
     spread = (*config.masked_spread, 0.0)
-    alone = [SceneParameters((name,), starts[[n]], upright[[n]], params.light, None) for n, name in enumerate(names)]
-    searches = [_Search(one, spread, config.masked_population, rng) for one in alone]
-    for _ in range(config.masked_iterations):
-        tried, losses = [], []
-        for n, search in enumerate(searches):
-            batch = search.ask()
-            losses.append(search.tell(masked_error(models, views, n, batch)))
-            tried.append(Pose(batch.positions[:, 0], batch.quaternions[:, 0]))
-        positions, quaternions = ([getattr(s.best, part) for s in searches] for part in ("positions", "quaternions"))
-        params = replace(params, positions=np.concatenate(positions), quaternions=np.concatenate(quaternions))
-        sigma = searches[0].sigma if searches else 1.0
-        yield reporter.step("objects", "Each object in its masks", params, tried, losses, sigma)
-    search = _Search(params, config.joint_spread, config.joint_population, rng)
-    yield from _descend(models, views, search, config.joint_iterations, reporter, has_masks=True)
+
+    def begun(n: int, quaternion: Float[np.ndarray, "4"]) -> _Search:
+        alone = SceneParameters((names[n],), best.positions[[n]], quaternion[None], best.light, None)
+        return _Search(alone, spread, config.masked_population, rng, config.converged)
+
+    for number in range(1, config.rounds + 1):
+        light = best.light  # that eq. 5 has
+        searches = [[begun(n, quaternion) for quaternion in turned[n]] for n in range(len(names))]
+        best = yield from _search_in_masks(models, views, best, searches, config.masked_iterations, reporter)
+        search = _Search(best, config.joint_spread, config.joint_population, rng, config.converged)
+        last = yield from _descend(models, views, search, config.joint_iterations, reporter, light)
+        best = search.best
+        if number == config.rounds:
+            yield last
+
+
+def _search_in_masks(
+    models: ObjectModels,
+    views: ObservedViews,
+    best: SceneParameters,
+    searches: list[list[_Search]],
+    iterations: int,
+    reporter: StepReporter,
+) -> Generator[EstimateStep, None, SceneParameters]:
+    """Run the searches for each object in its masks; return the scene with the best pose of each."""
+    for _ in range(iterations):
+        tried, losses, leading = [], [], []
+        for n, own in enumerate(searches):
+            poses = []
+            for search in own:
+                if not search.is_over:
+                    batch = search.ask()
+                    search.tell(masked_error(models, views, n, batch, best.light))
+                    poses.append(Pose(batch.positions[:, 0], batch.quaternions[:, 0]))
+            leading.append(min(own, key=lambda search: search.least))
+            losses.append(leading[-1].least)
+            if poses:
+                tried.append(Pose.joined(*poses))
+        if not tried:  # all searches are over
+            break
+        positions, quaternions = ([getattr(s.best, part) for s in leading] for part in ("positions", "quaternions"))
+        best = replace(best, positions=np.concatenate(positions), quaternions=np.concatenate(quaternions))
+        yield reporter.step("objects", "Each object in its masks", best, tried, losses, leading[0].sigma)
+    return best
 
 
 def estimate_next(
@@ -128,27 +171,35 @@ def estimate_next(
     models.check(observation.names)
     if set(before.names) != set(observation.names):
         raise InvalidInput("objects of the last estimate", ", ".join(before.names), ", ".join(observation.names))
-    views = views_of(observation, FINE_SIDE // 2)
+    views = views_of(observation, config.side)
     params = SceneParameters.of(before.reordered(observation.names), observation.pusher)
     search = _Search(params, (*config.later_spread, 0.0), config.later_population, rng)
     reporter = StepReporter(config.later_iterations + 1)
-    yield from _descend(models, views, search, config.later_iterations, reporter, has_masks=views.masks is not None)
+    overhead = None if views.masks is None else np.array(OVERHEAD)
+    yield (yield from _descend(models, views, search, config.later_iterations, reporter, overhead))
 
 
-def masked_error(models: ObjectModels, views: ObservedViews, number: int, batch: SceneBatch) -> Float[np.ndarray, "B"]:
+def masked_error(
+    models: ObjectModels,
+    views: ObservedViews,
+    number: int,
+    batch: SceneBatch,
+    light: Float[np.ndarray, "3"] | tuple[float, float, float] = OVERHEAD,
+) -> Float[np.ndarray, "B"]:
     """Return eq. 5: mean squared difference between one object rendered alone and the images inside its masks.
 
     Args:
         models: fields.
         views: with masks.
         number: of the object in the views.
-        batch: B scenes of this object alone, whose light does not count: L_init is overhead.
+        batch: B scenes of this object alone, whose own light does not count.
+        light: unit vector toward the light (L_init).
     """
     if views.masks is None:
         raise InvalidInput("masks of the views", "missing", "given: one per camera and object")
     wanted = views.images * views.masks[:, number, ..., None]
-    overhead = np.broadcast_to(OVERHEAD, batch.lights.shape)
-    alone = SceneBatch(batch.names, batch.positions, batch.quaternions, overhead, None)
+    lights = np.broadcast_to(light, batch.lights.shape)
+    alone = SceneBatch(batch.names, batch.positions, batch.quaternions, lights, None)
     return _mean_square(models.alone.render(alone, views.cameras, quality=views.quality).rgb, wanted)
 
 
@@ -170,18 +221,28 @@ def _mean_square(
 
 
 def _descend(
-    models: ObjectModels, views: ObservedViews, search: _Search, iterations: int, reporter: StepReporter, *,
-    has_masks: bool,
-) -> Iterator[EstimateStep]:  # fmt: skip
-    """Run CMA-ES over all poses and the light; with masks, eq. 5 of every object is added to eq. 6."""
+    models: ObjectModels,
+    views: ObservedViews,
+    search: _Search,
+    iterations: int,
+    reporter: StepReporter,
+    eq5_light: Float[np.ndarray, "3"] | None,
+) -> Generator[EstimateStep, None, EstimateStep]:
+    """Run CMA-ES over all poses and the light, and return the last step, with the estimate.
+
+    With a light for it, eq. 5 of every object is added to eq. 6.
+    """
     names = search.best.names
     loss = np.inf
     for _ in range(iterations):
+        if search.is_over:
+            break
         batch = search.ask()
         errors = scene_error(models, views, batch)
-        for n, name in enumerate(names if has_masks else ()):
-            own = SceneBatch((name,), batch.positions[:, [n]], batch.quaternions[:, [n]], batch.lights, None)
-            errors = errors + masked_error(models, views, n, own)
+        if eq5_light is not None:
+            for n, name in enumerate(names):
+                own = SceneBatch((name,), batch.positions[:, [n]], batch.quaternions[:, [n]], batch.lights, None)
+                errors = errors + masked_error(models, views, n, own, eq5_light)
         loss = search.tell(errors)
         tried = [Pose(batch.positions[:, n], batch.quaternions[:, n]) for n in range(len(names))]
         note = "All objects and the light" if search.scales[2] else "All objects"
@@ -190,16 +251,22 @@ def _descend(
     deviations = np.full(len(names), shift), np.full(len(names), 2 * turn)
     estimate = EstimatedState(search.best.state(), *deviations, light, ("",) * len(names), "")
     last = reporter.step("done", "Done", search.best, loss=loss)
-    yield replace(last, estimate=estimate)
+    return replace(last, estimate=estimate)
 
 
 class _Search:
     """CMA-ES around a scene, over 7 numbers for each object and 3 for the light."""
 
     def __init__(
-        self, start: SceneParameters, scales: tuple[float, float, float], population: int, rng: np.random.Generator
+        self,
+        start: SceneParameters,
+        scales: tuple[float, float, float],
+        population: int,
+        rng: np.random.Generator,
+        converged: float = 0.0,
     ) -> None:
-        self.best, self.scales, self._start, self._least = start, scales, start, np.inf
+        self.best, self.scales, self.least = start, scales, np.inf
+        self._start, self._converged = start, converged
         shift, turn, light = scales
         spread = np.array(([shift] * 3 + [turn] * 4) * len(start.names) + [light] * LIGHT)
         self._strategy = CMAES(spread, population, rng)
@@ -209,6 +276,11 @@ class _Search:
     def sigma(self) -> float:
         """Overall step, 1 at the beginning."""
         return self._strategy.sigma
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the step has become so small that nothing more is found."""
+        return self._strategy.sigma < self._converged
 
     def ask(self) -> SceneBatch:
         """Return the scenes of the next generation."""
@@ -229,11 +301,11 @@ class _Search:
         """Take the losses of these scenes and return the least so far."""
         self._strategy.tell(losses)
         k, batch = int(np.argmin(losses)), self._asked
-        if losses[k] < self._least and batch is not None:
-            self._least = float(losses[k])
+        if losses[k] < self.least and batch is not None:
+            self.least = float(losses[k])
             poses = {"positions": batch.positions[k], "quaternions": batch.quaternions[k]}
             self.best = replace(self.best, **poses, light=batch.lights[k])
-        return self._least
+        return self.least
 
 
 def _triangulated(observation: Observation, masks: Bool[np.ndarray, "V h w"], n: int) -> Float[np.ndarray, "3"]:

@@ -31,12 +31,14 @@ class SceneRequest:
         count: how many objects, where `names` is None.
         light: the light, or None for a random one at least 10 deg above the table.
         among: what to choose from, where `names` is None; all objects of the library if None.
+        is_upright: whether objects stand upright, as their meshes do, rather than in any resting orientation.
     """
 
     names: tuple[str, ...] | None = None
     count: int = 3
     light: Light | None = None
     among: tuple[str, ...] | None = None
+    is_upright: bool = False
 
 
 def check_request(library: AssetLibrary, request: SceneRequest) -> None:
@@ -94,20 +96,23 @@ _CALM_SPEED_M_S = 2e-3
 _CALM_TURN_RAD_S = 2e-2
 
 
-def place_randomly(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator) -> None:
+def place_randomly(
+    physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator, *, is_upright: bool = False
+) -> None:
     """Drop all objects in random stable poses without overlap, let them rest, put the pusher in a free place.
 
     Args:
         physics: a simulation of these objects; it starts over.
         assets: of the objects, by name.
         rng: draws poses and places.
+        is_upright: objects stand upright, as their meshes do; one that falls over rests as it fell.
 
     Raises:
         NoRoom: if no layout was found.
     """
     for _ in range(_LAYOUTS):
         physics.reset()
-        if not _lay_out(physics, assets, rng):
+        if not _lay_out(physics, assets, rng, is_upright):
             continue
         settle(physics, tuple(assets))
         is_inside = all(np.abs(physics.pose(name).position[:2]).max() <= WORKSPACE_HALF_M for name in assets)
@@ -196,18 +201,18 @@ def is_calm(physics: Physics, names: tuple[str, ...]) -> bool:
     return all(linear < _CALM_SPEED_M_S and angular < _CALM_TURN_RAD_S for linear, angular in speeds)
 
 
-def random_rest(asset: ObjectAsset, rng: np.random.Generator) -> Float[np.ndarray, "4"]:
-    """Draw a resting orientation by its probability, turned about the vertical at random."""
+def random_rest(asset: ObjectAsset, rng: np.random.Generator, *, is_upright: bool = False) -> Float[np.ndarray, "4"]:
+    """Draw a resting orientation by its probability, or the upright one, turned about the vertical at random."""
     choice = rng.choice(len(asset.resting.quaternions), p=asset.resting.probabilities)
     turn = quaternion_exp(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))
-    return quaternion_multiply(turn, asset.resting.quaternions[choice])
+    return turn if is_upright else quaternion_multiply(turn, asset.resting.quaternions[choice])
 
 
-def _lay_out(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator) -> bool:
+def _lay_out(physics: Physics, assets: Mapping[str, ObjectAsset], rng: np.random.Generator, is_upright: bool) -> bool:
     """Place all objects apart from each other; return whether there was room."""
     placed: list[str] = []
     for name in sorted(assets, key=lambda name: -assets[name].radius_m):  # large ones find no place later
-        quaternion = random_rest(assets[name], rng)
+        quaternion = random_rest(assets[name], rng, is_upright=is_upright)
         height = DROP_M - lowest_point(assets[name], quaternion)
         for _ in range(_TRIES_PER_OBJECT):
             x, y = rng.uniform(-WORKSPACE_HALF_M, WORKSPACE_HALF_M, 2)

@@ -157,7 +157,7 @@ class Tabletop:
             available = self._library.names() if self._request.among is None else self._request.among
             names = tuple(available[i] for i in rng.choice(len(available), self._request.count, replace=False))
         self._load_objects(names)
-        place_randomly(self._bodies, self.assets, rng)
+        place_randomly(self._bodies, self.assets, rng, is_upright=self._request.is_upright)
         drawn = Light.random(rng)  # drawn in any case, so that a given light leaves the rest of the scene alone
         self._light = drawn if self._request.light is None else self._request.light
         self._steps = 0

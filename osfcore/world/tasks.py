@@ -69,9 +69,12 @@ def draw_scene(
 
 
 @contextmanager
-def opened(draw: Draw, library: AssetLibrary, conditions: Conditions | None = None) -> Iterator[Tabletop]:
+def opened(
+    draw: Draw, library: AssetLibrary, conditions: Conditions | None = None, *, is_upright: bool = False
+) -> Iterator[Tabletop]:
     """Open the draw's scene as a world, under the usual conditions or others; close it at the end."""
-    world = Tabletop(library, request=SceneRequest(names=draw.names, light=draw.light), conditions=conditions)
+    request = SceneRequest(names=draw.names, light=draw.light, is_upright=is_upright)
+    world = Tabletop(library, request=request, conditions=conditions)
     try:
         for attempt in range(_LAYOUTS):
             try:
@@ -198,13 +201,14 @@ def arranged_goal(world: Tabletop, poses: Mapping[str, Pose], *, is_measured: bo
 
 # Rearrangement tasks: scenes at rest, some objects of which shall lie elsewhere (paper, section 5.4).
 #
-# Four families:
+# Five families:
 #
 #     shifted   objects lie elsewhere, as they lay.
 #     turned    objects lie elsewhere and turned about the vertical by 30 to 180 deg.
 #     crowded   the place of an object is taken by another one, which has to move first: it goes to a free place (2
 #               move), to that of the first one (a swap), or to that of a third one, which takes the first one's place.
 #     relit     the tasks of `shifted`; the goal is photographed under another light.
+#     upright   as `shifted`, but all objects stand upright, where the published estimation begins.
 #
 # Each task draws the objects; their resting orientations and places, as `place_randomly` does; a light, uniform
 # over the sky 5 deg and more above the table; which objects move, in turn 1, 2 and 3 of them (crowded: 2, 2 and 3);
@@ -213,7 +217,7 @@ def arranged_goal(world: Tabletop, poses: Mapping[str, Pose], *, is_measured: bo
 # moves by more than 2 mm or 0.03 rad when it is let go.
 
 
-Family = Literal["shifted", "turned", "crowded", "relit"]
+Family = Literal["shifted", "turned", "crowded", "relit", "upright"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
 MAX_OBJECTS = 6  # in a scene
 MIN_SHIFT_M = 0.075
@@ -287,7 +291,8 @@ def draw_task(library: AssetLibrary, tasks: TaskSet, number: int) -> DrawnTask:
     rejected: Counter[str] = Counter()
     for layout in range(_TASK_LAYOUTS):
         rng = stream_rng(tasks.seed, Stream.TASK_GOAL, FAMILIES.index(family), number, layout)
-        with opened(replace(draw, seed=int(rng.integers(1 << 31))), library) as world:
+        arranged, is_upright = replace(draw, seed=int(rng.integers(1 << 31))), family == "upright"
+        with opened(arranged, library, is_upright=is_upright) as world:
             start = world.truth()
             names = tuple(start.names[int(n)] for n in rng.permutation(len(start.names)))
             moved = _lay_out(world, family, names, number, rng)
