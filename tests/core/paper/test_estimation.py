@@ -91,3 +91,19 @@ def test_what_cannot_be_estimated_is_refused(plain, truth, seen):
         list(estimate_first(plain, replace(seen, masks=np.zeros_like(seen.masks)), rng, QUICK))
     with pytest.raises(InvalidInput, check=about("objects of the last estimate")):
         list(estimate_next(plain, seen, scene({"ball": truth.pose("ball")}), rng, QUICK))
+
+
+@pytest.mark.slow
+def test_a_second_round_has_the_light_that_was_found_and_searches_end_when_they_converge(plain, truth, seen):
+    starts = {name: np.array([[1.0, 0, 0, 0], [0, 0, 0, 1.0]]) for name in truth.names}
+    config = PaperEstimationConfig(
+        masked_iterations=60, masked_population=16, joint_iterations=60, joint_population=16, rounds=2, converged=0.3
+    )
+    steps = list(estimate_first(plain, seen, np.random.default_rng(0), config, starts))
+    assert len(steps) < 2 * (60 + 60)
+    assert [step.estimate is None for step in steps].count(False) == 1
+    masked = [step for step in steps if step.stage == "objects"]
+    overhead = [step for step in masked if np.array_equal(step.state.light.direction, (0, 0, 1))]
+    assert 0 < len(overhead) < len(masked)
+    tried = [len(step.candidates.position) for step in masked if step.candidates is not None]
+    assert max(tried) == 2 * 16  # of both searches for an object
