@@ -69,7 +69,7 @@ class Setting:
 
 
 _SHIPPED = PaperEstimationConfig()
-_MANY = replace(_SHIPPED, masked_iterations=25, masked_population=50)
+_MANY = replace(_SHIPPED, masked_iterations=25, masked_population=50, masked_spread=(0.02, 0.3))
 _CONVERGED = replace(_MANY, masked_iterations=150, joint_iterations=300, converged=0.02)
 SETTINGS: Mapping[str, Setting] = MappingProxyType(
     {
