@@ -58,7 +58,7 @@ def need(extra: str, what: str) -> None:
         raise MissingExtra(what, extra, lacking)
 
 
-def told_of(error: ModuleNotFoundError, what: str) -> MissingExtra | None:
+def as_missing_extra(error: ModuleNotFoundError, what: str) -> MissingExtra | None:
     """Explain an import that failed; None if no extra brings the module.
 
     Args:

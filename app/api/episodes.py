@@ -274,7 +274,7 @@ def list_all(
 
 @router.get("/{episode}", responses=problems(404, 409))
 def get(services: ServicesDep, job: FoundDep) -> EpisodeOut:
-    """Tell how an episode is: its steps so far with distances, costs and times, and how it ended."""
+    """Return how an episode is: its steps so far with distances, costs and times, and how it ended."""
     return _out(services, job)
 
 

@@ -209,7 +209,7 @@ def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterJob
 
 @router.get("/{estimate}", responses=problems(404, 409), response_model_exclude_unset=True)
 def get(services: ServicesDep, job: FoundDep) -> EstimateOut:
-    """Tell how an estimate is: its steps with their losses and, at the end, what it found and how sure it is."""
+    """Return how an estimate is: its steps with their losses and, at the end, what it found and how sure it is."""
     return _out(services.estimates, job)
 
 

@@ -107,7 +107,7 @@ def list_sets(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEn
 
 @router.get("/sets/{set_id}", responses=problems(404, 409))
 def get_set(services: ServicesDep, set_id: SetId) -> SetOut:
-    """Tell what is in an uploaded image set."""
+    """Return what is in an uploaded image set."""
     return SetOut.of(_found_set(services, set_id))
 
 
@@ -129,7 +129,7 @@ def overlay(services: ServicesDep, set_id: SetId) -> OpenFile:
 
 @router.get("/{name}", responses=problems(404))
 def get(services: ServicesDep, name: FieldName) -> FieldOut:
-    """Tell what is known of one field."""
+    """Return what is known of one field."""
     return _out(services, _known_field(services, name))
 
 

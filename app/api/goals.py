@@ -123,7 +123,7 @@ class GoalCheckOut(BaseModel):
         description='"bare": nothing is on the table; "elsewhere": not the table as its camera would see it; '
         '"others": not these objects.'
     )
-    refused: bool = Field(description="Whether episodes refuse it unless they are told to go on despite doubts.")
+    refused: bool = Field(description="Whether episodes refuse it unless they are asked to go on despite doubts.")
     text: str = Field(description="What is wrong and what to do; empty if nothing is.")
     scene: str | None = Field(description="The table that it was made for, if that is another one and still there.")
 
@@ -250,7 +250,7 @@ def begin(services: ServicesDep, body: DraftIn) -> DraftOut:
 
 @router.get("/draft", responses=problems(404))
 def draft(services: ServicesDep) -> DraftOut:
-    """Tell what is being composed."""
+    """Return what is being composed."""
     draft = services.goals.draft
     if draft is None:
         raise NoDraft
@@ -288,7 +288,7 @@ def save(services: ServicesDep, body: DraftKeep, response: Response) -> GoalOut:
 
 @router.get("/{goal}", responses=problems(404, 409))
 def get(record: FoundDep) -> GoalOut:
-    """Tell about a goal."""
+    """Return a goal."""
     return GoalOut.of(record)
 
 
@@ -306,7 +306,7 @@ def check(
     record: FoundDep,
     scene: Annotated[Identifier | None, Query(description="Identifier; by default the one shown.")] = None,
 ) -> GoalCheckOut:
-    """Tell within seconds whether a goal shows the objects of a table; the first time this waits for models."""
+    """Check within seconds whether a goal shows the objects of a table; the first time this waits for models."""
     found = services.goal_checks.check(record.id, scene)
     return GoalCheckOut(verdict=found.verdict, refused=found.is_refused, text=found.text, scene=found.scene)
 

@@ -136,7 +136,7 @@ async def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: Af
 
 @router.get("/{job}", responses=problems(404))
 async def get(job: FoundDep) -> JobOut:
-    """Tell how a job is."""
+    """Return how a job is."""
     return JobOut.of(job)
 
 

@@ -21,7 +21,7 @@ from osfcore.objects.fetch import DEFAULT_NAMES, MAX_MASS_KG, NewObject
 
 
 class SymmetryOut(BaseModel):
-    """Which rotations an eye cannot tell apart."""
+    """Which rotations look the same."""
 
     kind: Literal["none", "discrete", "continuous"]
     reason: str
@@ -91,7 +91,7 @@ async def add(
 
 @router.get("/{name}", responses=problems(404))
 def get(services: ServicesDep, name: Name) -> ObjectOut:
-    """Tell what is known of one object."""
+    """Return what is known of one object."""
     with named_in_path():
         return _object(services, name)
 

@@ -37,7 +37,7 @@ class DriverOut(BaseModel):
 
 @driver_router.get("")
 async def get(services: ServicesDep) -> DriverOut:
-    """Tell who drives."""
+    """Return who drives."""
     return DriverOut.model_validate(services.driver.now(), from_attributes=True)
 
 
@@ -190,7 +190,7 @@ class StoryList(BaseModel):
 def list_stories() -> StoryList:
     """List the stories, in the order in which the page plays them."""
     stories = Stories()
-    listed = [stories.told(name) for name in stories.names()]
+    listed = [stories.shown(name) for name in stories.names()]
     listed.sort(key=lambda story: _ORDER.index(story["name"]) if story["name"] in _ORDER else len(_ORDER))
     return StoryList(stories=[StoryOut.model_validate({**story, **_pictures(story["name"])}) for story in listed])
 

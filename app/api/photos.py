@@ -32,7 +32,7 @@ from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, TableS
 
 
 class CameraIn(Excerpt):
-    """A calibrated camera, as a calibration tells it; what it says of its accuracy does not matter."""
+    """A calibrated camera, as a calibration gives it; its stated accuracy does not matter."""
 
     name: DisplayName
     T_world_camera: list[list[FiniteFloat]] | None = None
@@ -67,7 +67,7 @@ class CalibrateIn(Input):
     """Photos of the board by one camera."""
 
     photos: list[Identifier] = Field(max_length=MOST_PHOTOS)
-    table: Identifier | None = Field(None, description="The board lying on the table; tells where the camera stands.")
+    table: Identifier | None = Field(None, description="The board lying on the table; shows where the camera stands.")
     place: PlaceIn = Field(default_factory=PlaceIn)
     name: DisplayName = Field("camera", description="Of the camera.")
 
@@ -80,7 +80,7 @@ class AdviceOut(BaseModel):
 
 
 class CalibrationOut(BaseModel):
-    """What the photos tell so far."""
+    """What the photos show so far."""
 
     missing: str = Field(description="Why they do not suffice, a sentence; empty where they do.")
     next: AdviceOut | None = Field(description="Null if nothing helps.")
@@ -116,7 +116,7 @@ class MarkIn(Input):
 
 
 class PhotoPatch(Input):
-    """Another focal length; null for what board or file tell. A calibrated camera counts instead of it."""
+    """Another focal length; null for what board or file give. A calibrated camera counts instead of it."""
 
     focal_px: Focal | None
     camera: CameraIn | None = Field(None, description="`camera` of a calibration.")
@@ -190,7 +190,7 @@ class PhotoFacts(BaseModel):
     width: int = Field(description="[px]")
     height: int = Field(description="[px]")
     focal_px: float = Field(description="In pixels of the photo as it was sent.")
-    focal_source: CameraSource = Field(description="Who tells it: the board, the user, the file, or nobody.")
+    focal_source: CameraSource = Field(description="Where it comes from: the board, the user, the file, or nowhere.")
     on_board: bool = Field(description="Whether the printed board is in view.")
 
 
@@ -200,7 +200,7 @@ class TablePhotoOut(PhotoFacts):
     notes: list[str] = Field(description="Sentences about photo, camera, table and light.")
     objects: list[MarkedOut]
     job: JobOut | None = Field(description="The search for what is marked now; null if there was none.")
-    table: TableSource | None = Field(description="What tells where the table is; null if nothing does, or not yet.")
+    table: TableSource | None = Field(description="How it is known where the table is; null if it is not, or not yet.")
     light: FoundLight | None = Field(description="In the frame of the poses.")
     doubts: list[str] = Field(description="Why nothing is made of it unless despite_doubts; empty where nothing is.")
     scene: str | None = Field(description="The table that it became.")
@@ -320,13 +320,13 @@ def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: AfterEnt
 
 @router.get("/board.pdf", response_class=Response, responses={200: {"content": {"application/pdf": {}}}})
 def board() -> Response:
-    """The board to print, an A4 page; laid on the table it tells where the camera was."""
+    """The board to print, an A4 page; laid on the table it shows where the camera was."""
     return Response(board_pdf(Board()), media_type="application/pdf")
 
 
 @router.get("/{photo}", responses=problems(404, 409))
 def get(services: ServicesDep, photo: PhotoDep) -> TablePhotoOut:
-    """Tell what is marked in a photo, and what was found."""
+    """Return what is marked in a photo, and what was found."""
     return _out(services, photo)
 
 
@@ -372,7 +372,7 @@ def choose(services: ServicesDep, photo: PhotoDep, name: ObjectPath, body: Choic
 @router.post("/{photo}/find", status_code=202, responses=problems(404, 409, 429, 507))
 @slow
 def find(services: ServicesDep, photo: PhotoDep, body: FindIn) -> TablePhotoOut:
-    """Find the marked objects and the lamp; `job` tells how far that is."""
+    """Find the marked objects and the lamp; `job` has its progress."""
     return _out(services, services.photos.find(photo.id, body.together, body.seed))
 
 
@@ -453,7 +453,7 @@ async def sight(
 @calibration_router.post("", responses=problems(503))
 @slow
 def assess(services: ServicesDep, body: CalibrateIn) -> CalibrationOut:
-    """Tell what photos of the board tell of the camera so far, what is missing and what helps most."""
+    """Return what photos of the board show of the camera so far, what is missing and what helps most."""
     place = board_place(body.place.x_m, body.place.y_m, body.place.turn_deg)
     found = services.board_photos.assess(body.photos, body.table, place)
     camera = CalibrationJson.model_validate(calibration_to_json(found, body.name))

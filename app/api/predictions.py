@@ -49,7 +49,7 @@ class Place(Excerpt):
 
 
 class StateIn(Excerpt):
-    """Where everything is: what scene.json, state.json and /api/scenes tell can be sent as it is."""
+    """Where everything is: what scene.json, state.json and /api/scenes hold can be sent as it is."""
 
     objects: list[PlacedObject] = Field(min_length=1, max_length=MAX_OBJECTS)
     light: Place | None = Field(None, description="Pushes do not depend on it.")

@@ -220,7 +220,7 @@ async def _on_broken_upload(_: Request, __: Exception) -> JSONResponse:
 
 async def _on_defect(request: Request, error: Exception) -> JSONResponse:
     _log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return problem(500, f"The service failed on this request ({type(error).__name__}); its log tells more.")
+    return problem(500, f"The service failed on this request ({type(error).__name__}); its log has more.")
 
 
 _MUST = {

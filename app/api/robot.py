@@ -120,14 +120,14 @@ Page = Annotated[Visitor | None, Header(alias=VISITOR_HEADER, description="What 
 @router.get("")
 @slow
 def get(services: ServicesDep) -> RobotOut:
-    """Tell which robot there is, its limits, and what it does. `host` is null where the service has none."""
+    """Return which robot there is, its limits, and what it does. `host` is null where the service has none."""
     return RobotOut.of(services.robot.now())
 
 
 @router.get("/cameras", responses=problems(404, 503))
 @slow
 def cameras(services: ServicesDep) -> list[RobotCameraOut]:
-    """Tell of each camera when it saw what its picture shows.
+    """Return for each camera when it saw what its picture shows.
 
     While an episode looks or moves that is its own last look, for nothing shall hold up the robot; else the robot looks
     now, at most once a second.
@@ -156,7 +156,7 @@ def create(services: ServicesDep, body: RobotEpisodeIn) -> RobotOut:
 @router.post("/confirmation", responses=problems(404, 409), dependencies=_DRIVER)
 @urgent
 def allow(services: ServicesDep, body: ConfirmationIn, page: Page = None) -> RobotOut:
-    """Let the robot move. A page that says so must tell every second that it is there, or the robot is stopped."""
+    """Let the robot move. A page that does so must confirm every second that it is there, or the robot is stopped."""
     return RobotOut.of(services.robot.allow(body.episode, page))
 
 
@@ -169,6 +169,6 @@ def stop(services: ServicesDep) -> RobotOut:
 
 @router.post("/presence", status_code=204)
 async def here(services: ServicesDep, page: Page = None) -> None:
-    """Tell that the page is still there which let the robot move."""
+    """Confirm that the page is still there which let the robot move."""
     if page is not None:
         services.robot.here(page)

@@ -159,7 +159,7 @@ async def list_all(services: ServicesDep, limit: Limit = DEFAULT_PAGE, after: Af
 
 @router.get("/{scene}", responses=problems(404))
 async def get(services: ServicesDep, scene: SceneId) -> SceneOut:
-    """Tell how a scene is now."""
+    """Return how a scene is now."""
     return scene_out(services, record_of(services, scene))
 
 

@@ -181,7 +181,7 @@ _TEXT: dict[int | str, dict[str, Any]] = {
 @router.get("/health", tags=["health"])
 @urgent
 def health(services: ServicesDep) -> Health:
-    """Tell that the service runs, and what is wrong with it."""
+    """Return that the service runs, and what is wrong with it."""
     runner, disk = services.runner, _disk_problem(services.settings.data_dir)
     stage = runner.scenes.status
     simulation = "The simulation has stopped and is being restarted." if stage == "restarting" else None
@@ -199,13 +199,13 @@ def health(services: ServicesDep) -> Health:
 
 @router.get("/metrics", tags=["metrics"], response_class=Response, responses=_TEXT)
 def metrics(request: Request) -> Response:
-    """Tell scenes, jobs, request times and memory in the format of Prometheus."""
+    """Return scenes, jobs, request times and memory in the format of Prometheus."""
     return Response(request.app.state.metrics.text(), headers={"Content-Type": CONTENT_TYPE})
 
 
 @router.get("/settings", tags=["settings"])
 async def settings() -> ServiceSettings:
-    """Tell defaults and bounds of an episode's settings."""
+    """Return defaults and bounds of an episode's settings."""
     return ServiceSettings.now()
 
 
@@ -214,7 +214,7 @@ storage_router = APIRouter(prefix="/api/storage", tags=["storage"], responses=pr
 
 @storage_router.get("")
 def usage(services: ServicesDep) -> StorageOut:
-    """Tell how much the data directory holds, by kind, and how much it may."""
+    """Return how much the data directory holds, by kind, and how much it may."""
     storage = services.runner.storage
     usage = storage.usage()
     return StorageOut(

@@ -103,9 +103,9 @@ def _parsed(arguments: list[str]) -> Command:
 def _explained(error: ValueError | ModuleNotFoundError) -> int:
     """Print what was wrong with the call (2), or what failed (1); raise anew what is no error of ours."""
     from osfcore.errors import InvalidInput, OsfError, UnknownName
-    from osfcore.extras import told_of
+    from osfcore.extras import as_missing_extra
 
-    explained = told_of(error, "This command") if isinstance(error, ModuleNotFoundError) else error
+    explained = as_missing_extra(error, "This command") if isinstance(error, ModuleNotFoundError) else error
     if not isinstance(explained, OsfError):
         raise error
     return _refuse(str(explained), 2 if isinstance(explained, InvalidInput | UnknownName) else 1)

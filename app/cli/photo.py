@@ -191,7 +191,7 @@ class PhotoEstimate(DataCommand):
         if not self.boxes and not self.masks:
             raise InvalidInput("number of boxes", 0, "1 or more, or --masks given: an object needs a box or a mask")
         if self.camera is not None and self.focal is not None:
-            raise InvalidInput("--focal", self.focal, "left out, since --camera tells the focal length")
+            raise InvalidInput("--focal", self.focal, "left out, since --camera has the focal length")
 
     def _masks(
         self, known: Collection[str], raw: RawPhotograph, boxes: Mapping[str, Box], number: int
@@ -224,7 +224,7 @@ def _box(text: str, paths: Sequence[Path], raws: Sequence[RawPhotograph]) -> tup
     raw = raws[fitting[0]]
     width, height = raw.sent_size
     if not (max(left, 0) < min(right, width) and max(top, 0) < min(bottom, height)):  # also false for NaN
-        allowed = f"within the photo's {width} x {height} pixels, told as LEFT,TOP,RIGHT,BOTTOM"
+        allowed = f"within the photo's {width} x {height} pixels, given as LEFT,TOP,RIGHT,BOTTOM"
         raise InvalidInput(f"box of {shown(name)} [px]", numbers, allowed)
     scale = max(raw.encoded.shape[:2]) / max(raw.sent_size)
     return fitting[0], name, (scale * left, scale * top, scale * right, scale * bottom)

@@ -72,7 +72,7 @@ def _cluster(address: str, answers_within_s: float) -> Iterator[Executor]:
         # while another one starts, both wait for Dask's lock for ever.
         asyncio.run(check())
     except (OSError, ValueError):
-        allowed = "that of a running Dask scheduler, such as tcp://127.0.0.1:8786 ('dask scheduler' tells its own)"
+        allowed = "that of a running Dask scheduler, such as tcp://127.0.0.1:8786 ('dask scheduler' prints its own)"
         raise InvalidInput("address of the cluster", address, allowed) from None
     with Client(address, timeout=answers_within_s, set_as_default=False) as client:
         try:

@@ -301,7 +301,7 @@ class NoClip(OsfError):
 
 @dataclass(frozen=True, slots=True)
 class ClipFacts:
-    """What the closing card tells that the trajectory does not.
+    """What the closing card shows that the trajectory does not.
 
     Attributes:
         is_reached: whether the goal was.
@@ -318,7 +318,7 @@ class ClipFacts:
 
     @staticmethod
     def of_report(report: Mapping[str, Any], actions: int) -> ClipFacts:
-        """What a report tells of an episode of so many actions; distances between its steps are interpolated."""
+        """Return what a report has of an episode of so many actions; distances between its steps are interpolated."""
         steps = report.get("steps", ())
         offsets = [step.get("truly_to_goal_mm") or step.get("to_goal_mm") for step in steps]
         far_m = None

@@ -120,7 +120,7 @@ def _actions(episode: FinishedEpisode) -> Float[np.ndarray, "T 2"]:
     except (TypeError, ValueError):
         actions = np.zeros(0)
     if actions.shape != expected:
-        raise CorruptFile(episode.folder / REPORT_FILE, f"it does not tell the {expected[0]} actions of the episode")
+        raise CorruptFile(episode.folder / REPORT_FILE, f"it does not have the {expected[0]} actions of the episode")
     return actions[:, :2]
 
 

@@ -30,7 +30,7 @@ class LookPictures:
     Args:
         renderer: of the episode's objects and the table.
         goal: of the episode.
-        clock: that tells the time [s].
+        clock: returns the time [s].
     """
 
     def __init__(

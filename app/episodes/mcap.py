@@ -153,7 +153,7 @@ def log_transforms(log: Log, trajectory: Trajectory) -> None:
 
 
 def log_scene(log: Log, trajectory: Trajectory, meshes: Mapping[str, TexturedMesh]) -> None:
-    """What everything looks like; frames tell where it is."""
+    """What everything looks like; frames say where it is."""
     table = messages.CubePrimitive(
         pose=at_origin(-_TABLE_M / 2), size=vector(TABLE_SIDE_M, TABLE_SIDE_M, _TABLE_M), color=colour_of(_WOOD)
     )

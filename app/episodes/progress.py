@@ -72,7 +72,7 @@ def _note_of(event: Looking) -> str:
 _LOOK_S = {"first": 30.0, "goal": 25.0}
 _ROUND_S = 4.0
 _PUSHES = 20
-_FEW = 3  # pushes that tell nothing of how many it takes
+_FEW = 3  # pushes from which nobody knows how many it takes
 
 
 class TimeLeft:
@@ -83,7 +83,7 @@ class TimeLeft:
     known. A rest that ends with `go_on` does not count.
 
     Args:
-        clock: tells the time [s].
+        clock: returns the time [s].
         finds_goal: whether the goal image is looked at for poses.
     """
 
@@ -101,7 +101,7 @@ class TimeLeft:
         self._now = self._clock()
 
     def take(self, event: Event, most: int) -> tuple[float, float]:
-        """What an event tells.
+        """Return what an event reports.
 
         Args:
             event: of the episode.

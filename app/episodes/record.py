@@ -44,7 +44,7 @@ _UNWRITTEN_SHARE = 0.05  # of the steps, at most
 
 
 class Table(Protocol):
-    """What only a simulation tells of a table; for reports, never for the loop."""
+    """What only a simulation knows of a table; for reports, never for the loop."""
 
     def truth(self) -> SceneState:
         """Where everything truly is."""
@@ -117,7 +117,7 @@ class EpisodeRecord:
         folder: for them.
         table: the simulated table; None where nobody knows the truth.
         about: what it was asked to be.
-        clock: tells the time [s].
+        clock: returns the time [s].
 
     Attributes:
         seconds: that it took so far, as the report has them [s].

@@ -153,7 +153,7 @@ def _layout(order: EpisodeOrder, path: Path) -> TableLayout:
     found = read_json(path, lambda data: decode(FoundScene, data, "found objects"))
     for what, given in (("goal image", order.goal), ("names of objects", order.names)):
         if given is not None:
-            allowed = "left out with what was found in a photo, which tells goal and objects"
+            allowed = "left out with what was found in a photo, which has goal and objects"
             raise InvalidInput(what, str(given), allowed)
     doubts = [each.doubt for each in found.objects if each.doubt]
     if doubts and not order.settings.despite_doubts:
@@ -175,7 +175,7 @@ def _begun(order: EpisodeOrder, world: Tabletop) -> Given:
     if order.goal is not None:
         goal = read_goal(order.goal, goal_camera())
         if order.moved is not None:
-            raise InvalidInput("number of objects that move", order.moved, "left out with a goal image, which tells it")
+            raise InvalidInput("number of objects that move", order.moved, "left out with a goal image, which shows it")
         return Given(world, goal, None, ())
     start, camera = world.truth(), goal_camera(order.goal_side)
     if order.shifts_m is None:

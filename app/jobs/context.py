@@ -24,7 +24,7 @@ _ANSWER_S = 300.0  # the service gives its simulation three minutes, and others 
 
 @dataclass(frozen=True, slots=True)
 class RunJob:
-    """Do a job. Answered by what its last step told, or by JobCancelled.
+    """Do a job. Answered by what its last step reported, or by JobCancelled.
 
     Attributes:
         kind: what to do.
@@ -47,7 +47,7 @@ class JobStep:
         done: units finished.
         total: units in all.
         note: what is being done, for a person.
-        result: what its kind tells besides.
+        result: what its kind reports besides.
         view: what the live view draws of it, and nobody keeps; None for most kinds.
     """
 
@@ -110,7 +110,7 @@ class JobContext:
     Attributes:
         data_dir: of the service.
         folder: the job's own, for what it makes; exists.
-        orders: what the service tells the job; set in the job's own process.
+        orders: what the service asks of the job; set in the job's own process.
     """
 
     data_dir: Path

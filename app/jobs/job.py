@@ -31,7 +31,7 @@ class Job:
         finished_at: when it ended, in whatever way.
         eta_s: time left, estimated [s].
         error: why it failed, one sentence.
-        result: what its kind tells at the end.
+        result: what its kind reports at the end.
         files: names that can be downloaded.
         position: in the queue, the next one has 1.
     """
@@ -81,7 +81,7 @@ class JobForgotten:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class JobView:
-    """What a running job lets the live view draw; it is neither kept nor told to pages."""
+    """What a running job lets the live view draw; it is neither kept nor sent to pages."""
 
     job: Job
     view: object

@@ -22,7 +22,7 @@ class JobKind:
         name: as it is asked for over REST and stored.
         words: what it is called for people.
         run: does it in the job's process, step by step: each step has `done`, `total` and `note`, and its other fields
-            are the job's result. A step may also have `view`, what the live view draws of it; `must_be_told`, if it
+            are the job's result. A step may also have `view`, what the live view draws of it; `must_be_reported`, if it
             must reach the service however soon it comes; and `ends_round`, where a job that goes on by single steps
             rests.
         params: of such a job, as REST takes them, as they are stored, and as `run` gets them.

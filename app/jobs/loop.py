@@ -37,7 +37,7 @@ class JobLoop:
         changed: guards the table; notified when a job is added or has ended.
         table: of all jobs.
         data_dir: of the service.
-        publish: told what the running job lets the live view draw.
+        publish: called with what the running job lets the live view draw.
         serve: carries out what a job asks for with the scene that it drives.
         start_process: of a job, its data directory, its folder and what takes its events.
     """
@@ -131,14 +131,14 @@ class JobLoop:
             clear_cancelled(self._data_dir, self._table, job)
         if then.state == "done":
             with contextlib.suppress(OSError):
-                sync_tree(self._folders.folder(job.id))  # before anybody is told that it is there
+                sync_tree(self._folders.folder(job.id))  # before anybody hears that it is there
         with self._changed:
             self.run = None
             self._table.set(replace(then, params=self._table[run.id].params))  # which may have changed meanwhile
             self._changed.notify_all()
 
     def _on_event(self, event: object) -> None:
-        """Take what the running job tells, in the thread that listens to it."""
+        """Take what the running job reports, in the thread that listens to it."""
         with self._changed:  # until it has been noted which job that is
             run = self.run
         assert run is not None
@@ -156,8 +156,8 @@ class JobLoop:
         with self._changed:
             job = self._table[run.id]
             result = step.result or None
-            told = step.result.get("left_s")  # by jobs whose parts take their time in different ways
-            eta_s = run.clock.left_s(step.done, step.total) if told is None else told
+            own_s = step.result.get("left_s")  # by jobs whose parts take their time in different ways
+            eta_s = run.clock.left_s(step.done, step.total) if own_s is None else own_s
             job = replace(job, done=step.done, total=step.total, note=step.note, eta_s=eta_s, result=result)
             self._table.set_progress(job)
         if step.view is not None:
@@ -179,7 +179,7 @@ class JobLoop:
             _log.exception("%s that a job asked for could not be done", type(asked.command).__name__)
             was_sent = run.order(Answer(asked.number, error=InternalError("service's answer to this job", error)))
         if not was_sent and not run.is_cancelled:
-            _log.warning("a job that takes no orders any more was not told what it had asked for")
+            _log.warning("a job that takes no orders any more did not get what it had asked for")
 
 
 def clear_cancelled(data_dir: Path, table: JobTable, job: Job) -> None:

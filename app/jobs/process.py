@@ -46,7 +46,7 @@ class JobProcess:
         job: what to do.
         data_dir: of the service.
         folder: the job's own; exists.
-        on_event: called from another thread with everything that the job tells.
+        on_event: called from another thread with everything that the job reports.
         client: a process that runs already; started here if None.
         on_end: called once the process has ended.
 
@@ -80,7 +80,7 @@ class JobProcess:
 
     @property
     def is_cancelled(self) -> bool:
-        """Whether it was told to stop."""
+        """Whether it was asked to stop."""
         return self._cancel_at < math.inf
 
     def order(self, message: object) -> bool:
@@ -88,7 +88,7 @@ class JobProcess:
         return self._client.notify(message)
 
     def cancel(self, grace_s: float) -> None:
-        """Tell it to stop, and to wait no longer than `grace_s` until it has. Calling it again does nothing."""
+        """Ask it to stop, and to wait no longer than `grace_s` until it has. Calling it again does nothing."""
         if not self.is_cancelled:
             self._cancel_at = time.monotonic() + grace_s
             self.order(CancelJob())
@@ -199,7 +199,7 @@ class Standby:
             job: what to do.
             data_dir: of the service.
             folder: the job's own; exists.
-            on_event: called from another thread with everything that the job tells.
+            on_event: called from another thread with everything that the job reports.
 
         Raises:
             OSError: if there can be no more processes.

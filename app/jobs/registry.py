@@ -53,7 +53,7 @@ class Jobs:
     Args:
         store: where they are kept.
         data_dir: objects are read from it, outputs go to `collections/JOB` in it.
-        publish: told of every change, and of what running jobs let the live view draw.
+        publish: called with every change, and with what running jobs let the live view draw.
         max_queued: how many may wait.
         cancel_grace_s: how long a cancelled job may take to stop by itself.
         serve: carries out what a job asks for with the scene that it drives.
@@ -189,7 +189,7 @@ class Jobs:
         Args:
             job: identifier.
             wait_s: for how long at most [s].
-            why: a sentence that the job tells from then on, where that is not clear.
+            why: a sentence that the job shows from then on, where that is not clear.
 
         Raises:
             UnknownName: if there is no such job.

@@ -15,19 +15,19 @@ from app.storage.database import Store
 from app.storage.paths import without_places
 from osfcore.errors import NotThere
 
-_EVENT_INTERVAL_S = 0.25  # progress is told to pages no more often than this
+_EVENT_INTERVAL_S = 0.25  # progress is sent to pages no more often than this
 
 
 class JobTable:
     """Jobs by identifier, oldest first. Callers hold one lock around every call that changes something.
 
-    A new job is stored before anybody hears of it. What becomes of it later is told in any case, since a full disk must
+    A new job is stored before anybody hears of it. What becomes of it later is sent in any case, since a full disk must
     not stop work; what could not be stored is stored as soon as the disk takes it.
 
     Args:
         store: where they are kept.
-        data_dir: whose place what is told of jobs does not name.
-        publish: told of every change; progress is thinned out.
+        data_dir: whose place is left out of what pages see of jobs.
+        publish: called with every change; progress is thinned out.
     """
 
     def __init__(self, store: Store, data_dir: Path, publish: Callable[[JobEvent], None]) -> None:
@@ -51,7 +51,7 @@ class JobTable:
     def all(self) -> list[Job]:
         """All jobs with their places in the queue, oldest first."""
         waiting = self._waiting()
-        return [self._told(job, waiting) for job in list(self._jobs.values())]
+        return [self._shown(job, waiting) for job in list(self._jobs.values())]
 
     def page(
         self,
@@ -76,8 +76,8 @@ class JobTable:
         start = 0 if before is None else bisect_right(found, -before, key=lambda job: -numbers[job.id])
         shown, waiting = found[start : start + limit], self._waiting()
         is_last = start + limit >= len(found)
-        told = tuple(self._told(job, waiting) for job in shown)
-        return JobPage(told, len(found), None if is_last else numbers[shown[-1].id])
+        jobs = tuple(self._shown(job, waiting) for job in shown)
+        return JobPage(jobs, len(found), None if is_last else numbers[shown[-1].id])
 
     def get(self, job: str, kind: str | None = None) -> Job:
         """One job with its place in the queue.
@@ -88,7 +88,7 @@ class JobTable:
         found = self._jobs.get(job)
         if found is None or kind not in (None, found.kind):
             raise NotThere(kind or "job")
-        return self._told(found, self._waiting() if found.state == "queued" else [])
+        return self._shown(found, self._waiting() if found.state == "queued" else [])
 
     def queue(self) -> list[Job]:
         """Jobs that wait, the next one first."""
@@ -144,23 +144,23 @@ class JobTable:
             self.set_progress(self._held_back)
 
     def publish_queue(self) -> None:
-        """Tell that positions in the queue have changed."""
+        """Publish that positions in the queue have changed."""
         for job in self.queue():
             self._keep(job)
 
     def _waiting(self) -> list[str]:
         return [job.id for job in self.queue()]
 
-    def _told(self, job: Job, waiting: list[str]) -> Job:
+    def _shown(self, job: Job, waiting: list[str]) -> Job:
         """A job with its place among those that wait and without the places of this machine."""
         error = None if job.error is None else without_places(job.error, self._data_dir)
-        told = replace(job, note=without_places(job.note, self._data_dir), error=error)
+        seen = replace(job, note=without_places(job.note, self._data_dir), error=error)
         if job.state != "queued":  # if it is, it may have begun just now: this is read without a lock
-            return told
-        return replace(told, position=1 + waiting.index(job.id)) if job.id in waiting else told
+            return seen
+        return replace(seen, position=1 + waiting.index(job.id)) if job.id in waiting else seen
 
     def _keep(self, job: Job) -> None:
-        shown, number = self._told(job, self._waiting()), self._numbers[job.id]
+        shown, number = self._shown(job, self._waiting()), self._numbers[job.id]
         event = self._store.save_job(  # a full disk must not stop the jobs
             job.id, number, job_fields(job), job_fields(shown), can_wait=True
         )

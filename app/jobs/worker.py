@@ -48,16 +48,16 @@ def job_main(server: ProcessServer, is_in_reserve: bool = False) -> None:
 def run_job(
     job: RunJob, control: JobControl, send: Callable[[object], None], step_interval_s: float = STEP_INTERVAL_S
 ) -> dict[str, Any] | JobCancelled:
-    """Do a job and tell of its steps.
+    """Do a job and report its steps.
 
     Args:
         job: what to do.
         control: orders that come meanwhile.
         send: takes JobStep and JobRests.
-        step_interval_s: steps that come faster are not told one by one [s].
+        step_interval_s: steps that come faster are not reported one by one [s].
 
     Returns:
-        What the last step told, or that the job was cancelled.
+        What the last step reported, or that the job was cancelled.
 
     Raises:
         OsfError: if the job cannot be done.
@@ -73,7 +73,7 @@ def run_job(
             extras = [field.name for field in dataclasses.fields(step) if field.name not in _NOT_EXTRA]
             result = {name: getattr(step, name) for name in extras}
             now = time.monotonic()
-            if now - last >= step_interval_s or step.done == step.total or getattr(step, "must_be_told", False):
+            if now - last >= step_interval_s or step.done == step.total or getattr(step, "must_be_reported", False):
                 send(JobStep(step.done, step.total, step.note, result, getattr(step, "view", None)))
                 last = now
             if getattr(step, "ends_round", False) and control.rests_now():

@@ -296,7 +296,7 @@ class ProcessClient:
                 try:
                     self.on_event(message)
                 except Exception:
-                    _log.exception("what the %s told could not be used", self._who)
+                    _log.exception("what the %s sent could not be used", self._who)
 
 
 # Messages on their way to a child process
@@ -402,7 +402,7 @@ class Watchdog:
 
 
 def _is_stopped(pid: int) -> bool:
-    """Whether the system has stopped a process; False where it does not tell."""
+    """Whether the system has stopped a process; False where that is not known."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="latin-1")
     except OSError:

@@ -1,4 +1,4 @@
-"""The predicting process: tells where sequences of actions would lead. It starts when somebody first asks.
+"""The predicting process: answers where sequences of actions would lead. It starts when somebody first asks.
 
 Only `predictor_main` is imported by the web process, by name; torch loads in the child.
 """

@@ -31,7 +31,7 @@ def scene_camera(name: str, size: int) -> Camera:
 
 
 def view_camera(position: object, quaternion: object, fov_y_rad: float, aspect: float, rows: int) -> Camera | None:
-    """The camera of a browser's view; None if what the browser told makes no sense.
+    """The camera of a browser's view; None if what the browser sent makes no sense.
 
     Args:
         position: in the world [m].

@@ -28,7 +28,7 @@ class InternalError(OsfError):
     """A defect of this program in a child process; its log has the traceback."""
 
     def __init__(self, who: str, error: Exception) -> None:
-        super().__init__(f"The {who} failed ({type(error).__name__}); the service's log tells more.")
+        super().__init__(f"The {who} failed ({type(error).__name__}); the service's log has more.")
 
 
 class OutOfMemory(OsfError):
@@ -93,7 +93,7 @@ class ProcessServer:
             self._connection.send(message)
 
     def show_life(self) -> None:
-        """Tell again and again that this process lives, until the service has gone."""
+        """Report again and again that this process lives, until the service has gone."""
         while not self._queue.is_closed():
             self.send(Alive())
             time.sleep(ALIVE_S)

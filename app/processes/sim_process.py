@@ -1,4 +1,4 @@
-"""The simulation's process: holds the scenes, carries out commands, tells what moves and what the cameras see.
+"""The simulation's process: holds the scenes, carries out commands, reports what moves and what the cameras see.
 
 The service imports only `simulation_main`; physics and ray tracing load in the child.
 """
@@ -277,7 +277,7 @@ class Simulation:
         return record
 
     def _stream(self, scene: str, steps: Iterator[SceneState], interval_s: float) -> SceneRecord:
-        """Run through the steps, then tell all of them; an interval of 0 spreads them over one action."""
+        """Run through the steps, then report all of them; an interval of 0 spreads them over one action."""
         states = tuple(steps)
         return self._report(self._record(scene), states, interval_s or STEP_S / max(len(states), 1))
 

@@ -33,7 +33,7 @@ class NoRoomToNudge(OsfError):
 
 
 class Disturber:
-    """Does to a scene what nobody tells the program. Blocks until it is done; any thread may call.
+    """Does to a scene what the program does not know of. Blocks until it is done; any thread may call.
 
     Args:
         scenes: of the service.
@@ -77,7 +77,7 @@ class Disturber:
 
     def _nudge(self, record: SceneRecord) -> tuple[SceneRecord, str]:
         state = record.state
-        # Those at the pusher last: what happens to them could be its doing, so that nothing of it is told.
+        # Those at the pusher last: what happens to them could be its doing, so that nothing of it is noticed.
         shuffled = [str(name) for name in self._rng.permutation(state.names)]
         for name in sorted(shuffled, key=lambda name: self._is_at_pusher(state, name)):
             pose = state.pose(name)

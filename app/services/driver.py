@@ -39,7 +39,7 @@ class Driver:
     """The pages that are open. Any thread may call.
 
     Args:
-        publish: told of every change.
+        publish: called with every change.
         grace_s: how long the wheel is kept for a driver whose page is gone [s].
     """
 

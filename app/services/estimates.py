@@ -217,7 +217,7 @@ class Estimates:
         return self._runner.jobs.get(estimate, KIND)
 
     def steps(self, job: Job) -> tuple[dict[str, Any], ...]:
-        """What was told of each step so far, see `read_steps`."""
+        """What was reported of each step so far, see `read_steps`."""
         return read_steps(self._runner.jobs.folder(job.id) / STEPS)
 
     def result(self, job: Job) -> EstimateJson | None:
@@ -313,7 +313,7 @@ class Uploaded:
     Attributes:
         names: of the objects.
         cameras: their names.
-        has_masks: whether it tells visible pixels.
+        has_masks: whether it has visible pixels.
         unseen: objects whose masks are all empty.
         has_prior: whether a state of how the objects lie came with it.
     """

@@ -52,7 +52,7 @@ class Hub:
         return len(self._listeners)
 
     def publish(self, event: object) -> None:
-        """Tell everyone. A listener that fails is logged and does not keep the others from hearing."""
+        """Call every listener. A listener that fails is logged and does not keep the others from hearing."""
         for listener in self._listeners:
             try:
                 listener(event)

@@ -176,8 +176,8 @@ class Stories:
         path = self.root / name / PREPARED_FILE
         return path if name in self.names() and path.is_file() else None
 
-    def told(self, name: str) -> dict[str, Any]:
-        """What the page tells of a story.
+    def shown(self, name: str) -> dict[str, Any]:
+        """Return what the page shows of a story.
 
         Raises:
             UnknownName: if there is none of this name.

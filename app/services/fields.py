@@ -51,7 +51,7 @@ class FieldCatalogue(FieldLibrary):
 
     Args:
         data_dir: of the service.
-        meshes: tells the names of the objects that scenes can hold.
+        meshes: have the names of the objects that scenes can hold.
     """
 
     def __init__(self, data_dir: Path, meshes: Callable[[], Collection[str]]) -> None:
@@ -59,7 +59,7 @@ class FieldCatalogue(FieldLibrary):
         self._data_dir, self._meshes = data_dir, meshes
 
     def all(self) -> tuple[FieldInfo, ...]:
-        """All fields that can be told about, sorted by name."""
+        """All fields that can be described, sorted by name."""
         infos = []
         for name in self.names():
             with contextlib.suppress(OsfError, OSError):  # one that is being deleted must not hide the others

@@ -93,7 +93,7 @@ class Goals(GoalStore):
     """The goals of one service. Methods that change something block; any thread may call.
 
     Args:
-        runner: holds the scenes, and tells everybody what has changed.
+        runner: holds the scenes, and publishes what has changed.
         data_dir: of the service.
         max_goals: kept at once.
         photos: decodes what is uploaded.
@@ -325,7 +325,7 @@ def _encoded(pixels: UInt8[np.ndarray, "h w 3"], kind: str, **options: int) -> b
     return data.getvalue()
 
 
-# Whether a goal can be one for a table, told within seconds and before anything starts, in words for people
+# Whether a goal can be one for a table, answered within seconds and before anything starts, in words for people
 
 
 GoalVerdict = Verdict | Literal["other table"]

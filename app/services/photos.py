@@ -85,7 +85,7 @@ class TablePhotos(TablePhotoStore):
     """The photographs of one service. Methods that change something block; any thread may call.
 
     Args:
-        runner: does the jobs, and tells everybody what has changed.
+        runner: does the jobs, and publishes what has changed.
         fields: what can be recognised.
         data_dir: of the service.
         max_photos: kept at once.
@@ -167,8 +167,8 @@ class TablePhotos(TablePhotoStore):
         if len({name, *(entry.name for entry in before.objects)}) > MAX_OBJECTS:
             raise InvalidInput("number of objects in the photo", len(before.objects) + 1, f"at most {MAX_OBJECTS}")
         others = tuple(point for each in before.objects if each.name != name for point in each.mark.on)
-        told = replace(mark, off=(*mark.off, *others))  # what is another object is not this one
-        found = self.looker.ask(FindMask(self.read(self.picture(photo), photo), told))
+        asked = replace(mark, off=(*mark.off, *others))  # what is another object is not this one
+        found = self.looker.ask(FindMask(self.read(self.picture(photo), photo), asked))
         assert isinstance(found, MaskFound)
         entry = MarkedObject(name, mark, found.outline)
         return self._outdated(photo, lambda latest: latest.with_object(entry), {mask_file(name): found.png})
@@ -269,7 +269,7 @@ class TablePhotos(TablePhotoStore):
     # Inside
 
     def change(self, photo: str, changed: Callable[[TablePhoto], TablePhoto], files: Files | None = None) -> TablePhoto:
-        """Keep other facts and files of a photograph, made of the latest ones, and tell so.
+        """Keep other facts and files of a photograph, made of the latest ones, and publish that.
 
         Raises:
             UnknownName: if there is none, or as `changed`.
@@ -377,7 +377,7 @@ class PhotoTables:
 
     Args:
         runner: makes tables.
-        photos: tells what was found.
+        photos: know what was found.
         goals: keeps goals.
         link: to the process that renders fields.
     """
@@ -547,7 +547,7 @@ class BoardPhotos:
         return identifier, sighting
 
     def assess(self, views: Sequence[str], table: str | None, T_world_board: Pose) -> Calibration:
-        """What photographs tell of the camera so far; arguments as of the core's `assess`, photographs by identifier.
+        """What photographs show of the camera so far; arguments as of the core's `assess`, photographs by identifier.
 
         Raises:
             UnknownName: if there is no such photograph.

@@ -170,7 +170,7 @@ class Predictions:
         before: SceneState | None = None,
         method: Method = "ours",
     ) -> Future[NeuralAnswer]:
-        """Ask where actions would lead; the future tells a Predicted, or None where a newer order of the key overtook.
+        """Ask where actions would lead; the future brings a Predicted, or None where a newer order of the key overtook.
 
         Args:
             state: of the scene, with its pusher.

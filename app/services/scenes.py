@@ -74,7 +74,7 @@ class Scenes:
         settings: of the service.
         store: keeps them.
         library: meshes of the objects.
-        hub: told of every change.
+        hub: called with every change.
         holder: returns what drives a scene, in words, if a job does: then only that job may change it.
     """
 
@@ -273,7 +273,7 @@ class Scenes:
         Args:
             scene: identifier.
             goal: the goal camera's view alone, without the pusher.
-            masks: whether to tell each object's visible pixels.
+            masks: whether to count each object's visible pixels.
 
         Raises:
             UnknownName: if there is no such scene.
@@ -325,7 +325,7 @@ class Scenes:
         return self._change(command) if isinstance(command, Act) else self._simulation.call(command)
 
     def watch_frames(self, change: int) -> None:
-        """Tell that `change` more (or less, if negative) listeners look at live images."""
+        """Count `change` more (or less, if negative) listeners to live images."""
         with self._lock:
             before, self._watchers = self._watchers, max(self._watchers + change, 0)
             if (before > 0) != (self._watchers > 0):
@@ -437,7 +437,7 @@ class SceneImages:
 
     Args:
         max_bytes: of the images that are kept.
-        revision_of: tells the revision of a scene; raises UnknownName if there is none.
+        revision_of: returns the revision of a scene; raises UnknownName if there is none.
         take: makes an image of a scene as it is now.
     """
 

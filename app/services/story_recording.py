@@ -69,7 +69,7 @@ def record_story(preset: Preset, data_dir: Path, out: Path) -> Iterator[EpisodeS
     _write_grid(out / "goal.webp", [part_of(frames[0], "goal")], columns=1)
     _write_grid(out / "now.webp", [part_of(frame, "now") for frame in frames], columns=NOW_COLUMNS)
     shutil.copyfile(folder / TRAJECTORY_FILE, out / TRAJECTORY_FILE)
-    write_json(out / STORY_FILE, _told(preset, read_json(folder / REPORT_FILE, as_mapping), out / TRAJECTORY_FILE))
+    write_json(out / STORY_FILE, _summary(preset, read_json(folder / REPORT_FILE, as_mapping), out / TRAJECTORY_FILE))
     shutil.rmtree(folder)
 
 
@@ -81,8 +81,8 @@ def _prepared(order: EpisodeOrder, seen: Observation, first: EstimatedState, goa
     return PreparedLooks(PreparedLook.of(models, seen, first), PreparedLook.of(models, image, goal.estimate))
 
 
-def _told(preset: Preset, report: dict[str, Any], trajectory: Path) -> dict[str, Any]:
-    """What the page tells; lengths in mm, angles in degrees, times in seconds of the replay."""
+def _summary(preset: Preset, report: dict[str, Any], trajectory: Path) -> dict[str, Any]:
+    """What the page shows; lengths in mm, angles in degrees, times in seconds of the replay."""
     course, steps = read_trajectory(trajectory), report["steps"]
     clock = ReplayClock(course)
     return {

@@ -108,7 +108,7 @@ def restore(archive: Path, data_dir: Path) -> Manifest:
 def _fill(archive: zipfile.ZipFile, data_dir: Path, database: Path) -> Manifest:
     """Write everything to an archive, the database by way of a temporary file."""
     sizes = []
-    # The database comes first: what it tells of was complete by then. A job that comes later merely adds files.
+    # The database comes first: what it names was complete by then. A job that comes later merely adds files.
     if (data_dir / FILE).exists():
         check_database(data_dir / FILE)
         copy_database(data_dir / FILE, database)

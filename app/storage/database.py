@@ -139,7 +139,7 @@ def utc_of(seconds: float, timespec: str = "milliseconds") -> str:
 
 
 def check_data_dir(data_dir: Path) -> None:
-    """Tell now what would keep a `Store` from opening; a file that it would put aside is left to it.
+    """Report now what would keep a `Store` from opening; a file that it would put aside is left to it.
 
     Raises:
         DataDirectoryInUse, CorruptFile, CannotStore: as `Store`.
@@ -353,7 +353,7 @@ class Store:
             job: identifier.
             number: orders the jobs; an update leaves it.
             fields: as JSON.
-            event: how it is told of, as JSON; None for the fields.
+            event: how it is sent to pages, as JSON; None for the fields.
             can_wait: remember it, if the disk refuses, and write it later.
 
         Returns:
@@ -416,7 +416,7 @@ class Store:
 
 
 def identities(*paths: Path) -> dict[Path, tuple[int, int] | None]:
-    """Return what tells a file or folder from any other that takes its name; None where there is none."""
+    """Return what distinguishes a file or folder from any other that takes its name; None where there is none."""
     found: dict[Path, tuple[int, int] | None] = dict.fromkeys(paths)
     for path in paths:
         with contextlib.suppress(OSError):
@@ -516,7 +516,7 @@ def _scene_of_row(row: Mapping[str, Any]) -> SceneRecord:
 
 
 def _job_of_row(text: str, job: str | None = None) -> dict[str, Any]:
-    """The fields of a job in a row, such that they can be told to pages.
+    """The fields of a job in a row, such that they can be sent to pages.
 
     Args:
         text: that was stored.

@@ -37,7 +37,7 @@ def open_workshop(data_dir: Path, name: str, order: dict[str, Any]) -> Path:
     Args:
         data_dir: of the service.
         name: of the field.
-        order: plain JSON that tells everything the field will depend on.
+        order: plain JSON of everything the field will depend on.
 
     Raises:
         CannotWrite: if it cannot be made.

@@ -193,8 +193,8 @@ def folder_bytes(path: Path, is_stopping: threading.Event | None = None) -> int:
 def _advice(found: dict[str, int]) -> str:
     """What to delete, the largest first."""
     names = sorted(_DELETABLE, key=lambda kind: -found.get(kind, 0))
-    told = [f"{_DELETABLE[kind]}{f' ({_size(found[kind])})' if found.get(kind) else ''}" for kind in names]
-    return f"delete some {', '.join(told[:-1])} or {told[-1]}"
+    parts = [f"{_DELETABLE[kind]}{f' ({_size(found[kind])})' if found.get(kind) else ''}" for kind in names]
+    return f"delete some {', '.join(parts[:-1])} or {parts[-1]}"
 
 
 def _size(count: int) -> str:

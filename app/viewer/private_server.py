@@ -36,7 +36,7 @@ class PrivateViser(viser.ViserServer):
 
     def __init__(self) -> None:
         self.secret = secrets.token_urlsafe(32)
-        # The banner would tell the port. viser has no hook for handshakes, so its call of `serve` is given one.
+        # The banner would show the port. viser has no hook for handshakes, so its call of `serve` is given one.
         with contextlib.redirect_stdout(io.StringIO()), _guarding(self._refuse):
             super().__init__(host="127.0.0.1", port=0, verbose=False)
         self._pages: dict[int, str] = {}

@@ -154,7 +154,7 @@ class PushPanel(Panel):
         finally:
             with self._thread.changing():
                 self._executing = None
-                self._message = message or "Not executed; the log tells more"
+                self._message = message or "Not executed; the log has more"
                 if message == _CHANGED:
                     self._prediction = None
 
@@ -193,7 +193,7 @@ class PushPanel(Panel):
             self._run_command(answer.result, client)  # which notifies of the same
             return
         except Exception:
-            self._say("The prediction failed; the log tells more")
+            self._say("The prediction failed; the log has more")
             raise
         with self._thread.changed:
             if not isinstance(predicted, Predicted):  # overtaken by a newer request

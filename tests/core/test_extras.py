@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from osfcore.extras import PACKAGES, MissingExtra, missing, need, told_of
+from osfcore.extras import PACKAGES, MissingExtra, as_missing_extra, missing, need
 from tests.support.errors import about
 
 
@@ -16,9 +16,9 @@ def test_missing_packages_are_named_with_their_extra(monkeypatch):
     with pytest.raises(MissingExtra, check=about("viser")) as error:
         need("serve", "The service")
     assert "pip install 'osf-manipulation[serve]'" in str(error.value)
-    failed = told_of(ModuleNotFoundError("none", name="pybullet.client"), "This command")
+    failed = as_missing_extra(ModuleNotFoundError("none", name="pybullet.client"), "This command")
     assert (failed.extra, failed.missing) == ("sim", ["pybullet"])
-    assert told_of(ModuleNotFoundError("none", name="teapot"), "This command") is None
+    assert as_missing_extra(ModuleNotFoundError("none", name="teapot"), "This command") is None
     assert "3.11" not in str(failed)
     monkeypatch.setattr(sys, "version_info", (3, 13, 0))  # PyBullet is not promised where it has no wheels
     assert "3.11" in str(MissingExtra("It", "sim", ["pybullet"]))

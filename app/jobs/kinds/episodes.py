@@ -72,7 +72,7 @@ class EpisodeJobProgress(EpisodeProgress):
         return isinstance(self.view, Stepped)
 
     @property
-    def must_be_told(self) -> bool:
+    def must_be_reported(self) -> bool:
         """Whether a view that misses this would show something wrong."""
         return self.view is not None and not isinstance(self.view, Looking)
 
@@ -289,7 +289,7 @@ class RemoteWorld:
         """Do nothing: the scene is the page's."""
 
     def truth(self) -> SceneState:
-        """Where everything truly was, at the last moment that was told; for reports, never for the loop."""
+        """Where everything truly was, at the last moment that was reported; for reports, never for the loop."""
         record = self.record or self._ask(Act(self._scene, ()))
         self.record = record
         return record.state

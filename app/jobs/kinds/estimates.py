@@ -1,4 +1,4 @@
-"""The job that estimates poses and light from an observation: told step by step, with all steps kept in a file.
+"""The job that estimates poses and light from an observation: reported step by step, with all steps kept in a file.
 
 Its inputs lie in the job's folder: `inputs/observation`, and `inputs/prior.json` where an earlier estimate is needed.
 It leaves `steps.jsonl`, one line a step, and `state.json`.
@@ -179,7 +179,7 @@ def check_method(mode: Mode, method: Method) -> None:
 
 
 def read_steps(path: Path) -> tuple[dict[str, Any], ...]:
-    """What was told of each step so far, with "guess", a scene without cameras; nothing before the first one.
+    """What was reported of each step so far, with "guess", a scene without cameras; nothing before the first one.
 
     Raises:
         CorruptFile: if the file is damaged.

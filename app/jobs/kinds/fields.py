@@ -98,8 +98,8 @@ class TrainingStep(Progress):
     left_s: float | None = None
 
     @property
-    def must_be_told(self) -> bool:
-        """Whether a part begins of which nothing is told before its end."""
+    def must_be_reported(self) -> bool:
+        """Whether a part begins that reports nothing before its end."""
         return self.note == _COMPARING
 
 

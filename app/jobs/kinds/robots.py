@@ -51,7 +51,7 @@ class RobotProgress(EpisodeProgress):
     doubts: tuple[str, ...] = ()
 
     @property
-    def must_be_told(self) -> bool:
+    def must_be_reported(self) -> bool:
         """Whether whoever misses this would not know what the robot waits for."""
         return self.drives in ("asked", "lost")
 

@@ -38,7 +38,7 @@ class PhotoRead:
         height: of the picture [px].
         sent_width: of the photo as it was sent [px].
         K: intrinsics [px].
-        source: who tells the focal length.
+        source: where the focal length comes from.
         T_world_camera: pose over the printed board; None if the photo shows none.
         notes: sentences for the user.
     """

@@ -153,7 +153,7 @@ class ObserveScene:
     Attributes:
         id: of the scene.
         goal: the goal camera's view alone, without the pusher.
-        masks: whether to tell each object's visible pixels.
+        masks: whether to count each object's visible pixels.
     """
 
     id: str

@@ -70,7 +70,7 @@ def test_an_object_is_found_by_its_box(taken, photo, tmp_path, capsys):
     [
         (f"{NAME}:1,2,3", "box is"),
         (f"{NAME}:1,2,3,nan", "within the photo's 300 x 260 pixels"),
-        (f"{NAME}:200,20,20,200", "told as LEFT,TOP,RIGHT,BOTTOM"),
+        (f"{NAME}:200,20,20,200", "given as LEFT,TOP,RIGHT,BOTTOM"),
         (
             f"{NAME}:900,900,990,990",
             f"box of {NAME} [px] is 900,900,990,990, but it must be within the photo's 300 x 260",

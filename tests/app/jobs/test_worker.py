@@ -168,7 +168,7 @@ class Told:
     """A step of a job, as many come in no time."""
 
     done: int
-    must_be_told: bool
+    must_be_reported: bool
     total: int = 100
     note: str = "Working"
     view: str | None = None
@@ -192,12 +192,12 @@ def run(monkeypatch, steps, orders=()):
     return told, outcome
 
 
-def test_steps_that_must_be_told_are_never_thinned_out(monkeypatch):
+def test_steps_that_must_be_reported_are_never_thinned_out(monkeypatch):
     steps = [Told(number, number % 3 == 0, view=f"view {number}") for number in range(30)]
     told, outcome = run(monkeypatch, steps)
     assert [step.done for step in told] == list(range(0, 30, 3))
     assert [step.view for step in told] == [f"view {number}" for number in range(0, 30, 3)]
-    assert outcome == {"must_be_told": False, "ends_round": False}
+    assert outcome == {"must_be_reported": False, "ends_round": False}
 
 
 def test_steps_that_come_too_fast_are_not_told_but_the_last_one_is(monkeypatch):

@@ -21,7 +21,7 @@ def test_every_example_has_a_story_and_it_is_small():
 @pytest.mark.parametrize("preset", PRESETS, ids=lambda preset: preset.id)
 def test_a_story_tells_of_its_example_what_its_course_shows(preset):
     stories = Stories()
-    told, course = stories.told(preset.id), read_trajectory(stories.trajectory(preset.id))
+    told, course = stories.shown(preset.id), read_trajectory(stories.trajectory(preset.id))
     assert told["objects"] == list(course.names) == list(preset.objects)
     assert len(told["moved"]) == len(preset.shifts_m)
     assert told["step_s"] == pytest.approx(ReplayClock(course).step_s, abs=1e-3)
@@ -44,4 +44,4 @@ def test_what_is_not_there_is_told(tmp_path):
     (tmp_path / "odd").mkdir()
     (tmp_path / "odd" / "story.json").write_text("[]")
     with pytest.raises(CorruptFile):
-        stories.told("odd")
+        stories.shown("odd")

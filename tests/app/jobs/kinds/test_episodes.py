@@ -123,7 +123,7 @@ def test_what_is_told_rises_and_names_every_part_of_the_loop(place, stage, sight
 @pytest.mark.slow
 def test_what_a_view_must_not_miss_says_so(place, stage, sighted):  # noqa: F811
     for step in episode_job(params(stage), place):
-        assert step.must_be_told == (step.view is not None and not isinstance(step.view, Looking))
+        assert step.must_be_reported == (step.view is not None and not isinstance(step.view, Looking))
 
 
 def test_pages_are_told_the_stage_and_the_outcome(place, monkeypatch):
@@ -233,7 +233,7 @@ def test_rounds_end_where_a_step_of_the_loop_does():
     assert EpisodeJobProgress(1, 3, "Looking", view=stepped).ends_round
     assert not EpisodeJobProgress(1, 3, "Pushing", view=ActionExecuted(1, np.zeros(3))).ends_round
     assert not EpisodeJobProgress(0, 3, "Loading").ends_round
-    assert not EpisodeJobProgress(0, 3, "Loading").must_be_told
+    assert not EpisodeJobProgress(0, 3, "Loading").must_be_reported
 
 
 # The method as published
