@@ -441,7 +441,7 @@ class EvaluatePhotosCommand(DataCommand):
 
 @dataclass(frozen=True)
 class ReproduceCommand(DataCommand):
-    """The paper's experiments, its rivals, and what else there is to know, as one HTML page.
+    """The paper's figures 5, 6 and 7, its rivals, and what else there is to know, as one HTML page.
 
     A killed run goes on when started again. Without --quick it takes days on two cores.
     """

@@ -27,7 +27,7 @@ COMMANDS = {
     "lerobot": ("episode:LeRobot", "Write episodes as a LeRobot data set."),
     "record": ("episode:Record", "Make the stories that the page plays."),
     "eval": ("evaluate:Evaluate", "Measure how good trained parts are."),
-    "reproduce": ("evaluate:ReproduceCommand", "The paper's experiments in one report."),
+    "reproduce": ("evaluate:ReproduceCommand", "The paper's figures 5, 6 and 7, and more, in one report."),
     "bench": ("bench:Bench", "Measure what things cost on this machine."),
     "export": ("exchange:Export", "Scenes, fields and poses for other programs."),
     "import": ("exchange:Import", "Data sets of others for 'osf estimate'."),

@@ -270,7 +270,7 @@ def _only(what: str, asked: int | str | None, there: set[int] | set[str]) -> Any
         return next(iter(there))
     if asked not in there:
         some = shown(", ".join(str(one) for one in sorted(there)))
-        raise InvalidInput(what, "not told" if asked is None else asked, f"one of {some or 'none'}")
+        raise InvalidInput(what, "missing" if asked is None else asked, f"one of {some or 'none'}")
     return asked
 
 
@@ -484,7 +484,7 @@ def _bop_files(folder: Path, image: int | None) -> dict[str, Path]:
     shown = _only("image of the masks", image, {int(match[1]) for match in numbered})
     table = next((place / SCENE_GT for place in (folder, folder.parent) if (place / SCENE_GT).is_file()), None)
     if table is None:
-        raise InvalidInput(f"{SCENE_GT} of the masks", "missing", "in the folder above them: it tells what they show")
+        raise InvalidInput(f"{SCENE_GT} of the masks", "missing", "in the folder above them: it names what they show")
     names = scene_gt_names(table, shown)
     its = {int(match[2]): folder / match[0] for match in numbered if int(match[1]) == shown}
     return {name: its[index] for index, name in enumerate(names) if index in its}

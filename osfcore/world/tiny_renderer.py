@@ -1,7 +1,7 @@
 """Pictures by PyBullet's TinyRenderer, as in the paper: a choice beside ray tracing and the yardstick for speed.
 
 Its shadow is not the image model's: it removes about a fifth of the diffuse term, depends on the camera and is falsely
-dark at low light. Nothing is trained or tested on it.
+dark at low light. Nothing is trained on it.
 """
 
 from __future__ import annotations

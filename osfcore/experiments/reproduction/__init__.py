@@ -1,1 +1,1 @@
-"""The paper's experiments in one report."""
+"""The paper's figures 5, 6 and 7, and more, in one report."""
