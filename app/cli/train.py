@@ -199,6 +199,8 @@ class TrainFitVidCommand(DataCommand):
     """How long to train [min]."""
     iterations: int | None = None
     """Instead of a time budget: that many steps of descent, repeatable on one machine."""
+    side: int | None = None
+    """Of its images [px], to which recorded frames are averaged down; as they were recorded without it."""
     width: int = 4
     """Channels at full size; they double whenever the image is halved."""
     batch: int = 8

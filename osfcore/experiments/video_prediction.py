@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -105,7 +105,7 @@ VERSION = 1  # raised by hand when figures may change
 
 @dataclass(frozen=True, slots=True)
 class CompareVideos(CompareImages):
-    """What to compare: episodes by some of `VIDEO_METHODS`, in frames of the side that FitVid's network has.
+    """What to compare: episodes by some of `VIDEO_METHODS`; with FitVid among them, frames have its network's side.
 
     Attributes:
         steps: actions of 0.2 s that are predicted.
@@ -128,16 +128,14 @@ def compare_videos(
 
     Raises:
         UnknownName, MissingAssets: if an object lacks a field or a mesh.
-        InvalidInput: if a number is out of range, objects are too few, or FitVid's network has another image size.
+        InvalidInput: if a number is out of range, or objects are too few.
         NoRoom: if there is no room for a scene's objects.
         WorkerDied: if a worker process ended.
         CorruptFile, CannotWrite: as files are.
     """
     config = checked(config, VIDEO_METHODS, fields, assets, ("predicted steps", config.steps, 1, MAX_HORIZON))
     if "fitvid" in config.methods:
-        side = read_fitvid(fitvid_path(config.data_dir)).settings.side
-        if side != config.size:
-            raise InvalidInput("image size [px]", config.size, f"{side}, as FitVid's network has")
+        config = replace(config, size=read_fitvid(fitvid_path(config.data_dir)).settings.side)
     names = config.names or ()
     ours = network_path(config.data_dir)
     paths = {"ours": ours, "nerf": ours, "paper": weights_path(config.data_dir)}

@@ -10,14 +10,16 @@ with the last context frame c, and what is minimised is sum_t |x_t - x'_t|^2 (a 
 with z_t from the posterior and true frames behind h_t-1. To predict, z_t comes from the prior, and behind the context
 h_t-1 from the predicted frame.
 
-Deviations from the published program: images are of 128 pixels instead of 64, as in the paper that is reproduced here,
-by one more stage in front, so that the coarsest maps stay 8 x 8 pixels; channels start with 4 at full size and double
-per stage, so that at 64 pixels there are 8 where the original has 64 (7.4 instead of 302 million parameters). Batch
-norm takes its statistics over all steps of a batch at once, not step by step. The frame predictor has no variance,
-which the original computes and never uses. The decoder changes the last context frame, where the original's draws a
-new one. Encoder and decoder may compute in bfloat16. Predictions take the skip connections from the last
-context frame, as training does; the original takes those of the first one there. Actions are in units of the highest
-speed.
+Deviations from the published program: channels start with 4 at full size, where the original has 64, and double per
+stage; there are as many stages as leave 8 x 8 pixels to the coarsest maps, whatever the images' size. A frame's
+vector is a linear function of its whole coarsest map, not of the map's mean: of so few channels the mean does not
+tell where anything is. The network that ships has the mean, and ignores actions (docs/evaluation.md). The frame
+predictor's last layer begins 30 times larger, for else its sigmoid begins within 0.001 of a half and says nothing to
+the decoder. Batch norm takes its statistics over all steps of a batch at once, not step by step. The frame predictor
+has no variance, which the original computes and never uses. The decoder changes the last context frame, where the
+original's draws a new one. Encoder and decoder may compute in bfloat16. Predictions take the skip connections from
+the last context frame, as training does; the original takes those of the first one there. Actions are in units of the
+highest speed.
 """
 
 from __future__ import annotations
@@ -249,16 +251,18 @@ Skips = Sequence[Float[Tensor, "_ _ _ _"]]  # features after each of the encoder
 
 
 class Encoder(nn.Module):
-    """A frame as a vector: stages of two cells, all but the first beginning by halving the image, then a mean over it.
+    """A frame as a vector: stages of two cells, all but the first beginning by halving the image, then a linear layer.
 
     Args:
         stages: their number; channels double from one to the next.
         width: channels of the first stage.
         features: length of the vector (g).
+        is_pooled: whether the linear layer sees the coarsest map's mean, as in the original, or all of it.
     """
 
-    def __init__(self, stages: int, width: int, features: int) -> None:
+    def __init__(self, stages: int, width: int, features: int, *, is_pooled: bool = False) -> None:
         super().__init__()
+        self._is_pooled = is_pooled
         cells, before = [], 3
         for stage in range(stages):
             for cell in range(_CELLS):
@@ -266,7 +270,7 @@ class Encoder(nn.Module):
                 cells.append(EncoderCell(before, after, 2 if stage > 0 and cell == 0 else 1))
                 before = after
         self.cells = nn.ModuleList(cells)
-        self.head = nn.Linear(before, features)
+        self.head = nn.Linear(before if is_pooled else before * COARSEST_SIDE**2, features)
 
     def forward(self, frames: Float[Tensor, "B 3 h w"]) -> tuple[Float[Tensor, "B g"], list[Float[Tensor, "B _ _ _"]]]:
         """Return the vector of each frame, and the features after each cell."""
@@ -275,7 +279,7 @@ class Encoder(nn.Module):
         for cell in self.cells:
             x = cell(x)
             skips.append(x)
-        return self.head(x.mean(dim=(2, 3))), skips
+        return self.head(x.mean(dim=(2, 3)) if self._is_pooled else x.flatten(1)), skips
 
 
 class Decoder(nn.Module):
@@ -319,6 +323,7 @@ class Decoder(nn.Module):
 
 
 CONTEXT = 2  # frames that are given
+_FIRST_GAIN = 30.0  # of the layer from which vectors of next frames come
 _ACTION = 3
 _MOST_STAGES = 8
 _AT_ONCE = 32  # sequences: more would take memory and no less time
@@ -334,6 +339,7 @@ class FitVidSettings:
         features: length of a frame's vector (g).
         hidden: units of the LSTMs.
         latent: components of z.
+        is_pooled: whether a frame's vector comes from the mean of its coarsest map, as in the original.
     """
 
     side: int = 128
@@ -341,6 +347,7 @@ class FitVidSettings:
     features: int = 128
     hidden: int = 256
     latent: int = 10
+    is_pooled: bool = False
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -387,7 +394,7 @@ class FitVidModel(nn.Module):
         super().__init__()
         self.settings = s = settings or FitVidSettings()
         self.precision = precision
-        self.encoder = Encoder(s.stages, s.width, s.features)
+        self.encoder = Encoder(s.stages, s.width, s.features, is_pooled=s.is_pooled)
         self.decoder = Decoder(s.stages, s.width, s.features)
         self.posterior = LatentLSTM(s.features, s.hidden, s.latent)
         self.prior = LatentLSTM(s.features, s.hidden, s.latent)
@@ -398,6 +405,8 @@ class FitVidModel(nn.Module):
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
         nn.init.zeros_(self.decoder.colours.weight)
+        with torch.no_grad():
+            self.frame_predictor.head.weight *= _FIRST_GAIN
 
     @property
     def parameter_count(self) -> int:
@@ -535,7 +544,7 @@ def write_fitvid(path: Path, model: FitVidModel) -> None:
         name: (value.detach().half() if name in halved else value.detach()).cpu().contiguous()
         for name, value in model.state_dict().items()
     }
-    sizes = {name: str(value) for name, value in asdict(model.settings).items()}
+    sizes = {name: str(int(value)) for name, value in asdict(model.settings).items()}
     write_atomically(path, save(tensors, {"format": FORMAT, **sizes}))
 
 
@@ -551,7 +560,9 @@ def read_fitvid(path: Path, precision: torch.dtype = torch.float32) -> FitVidMod
     """
     metadata, values = read_parameters(path, FORMAT, "video prediction network")
     try:
-        settings = FitVidSettings(**{size.name: int(metadata[size.name]) for size in fields(FitVidSettings)})
+        known = {"is_pooled": "1", **metadata}  # files of before say nothing of it
+        sizes = {size.name: int(known[size.name]) for size in fields(FitVidSettings)}
+        settings = FitVidSettings(**{**sizes, "is_pooled": bool(sizes["is_pooled"])})
     except (KeyError, ValueError) as error:
         raise CorruptFile(path, f"it holds no video prediction network of known size ({shown(error)})") from error
     with torch.device("meta"):  # what the file describes may be larger than what it holds

@@ -138,7 +138,7 @@ class Videos(NamedTuple):
     held_out: list[Video]
 
 
-def read_videos(paths: Sequence[Path], device: torch.device | str = "cpu") -> Videos:
+def read_videos(paths: Sequence[Path], side: int | None = None, device: torch.device | str = "cpu") -> Videos:
     """Read push files with frames: at 128 pixels a thousand episodes of 50 actions take 2.5 GB of memory.
 
     As for dynamics, one episode in twelve of each file is held out, and so is every other one in which a pair of
@@ -146,20 +146,22 @@ def read_videos(paths: Sequence[Path], device: torch.device | str = "cpu") -> Vi
 
     Args:
         paths: of the files.
+        side: to which frames are averaged down [px]; as they are recorded if None.
         device: that holds frames and actions.
 
     Raises:
         CorruptFile: if one is no push file, or has no frames.
-        InvalidInput: if frames differ in size between files, or nothing is left to learn from or to measure on.
+        InvalidInput: if frames differ in size between files or cannot be averaged down to that side, or nothing is left
+            to learn from or to measure on.
     """
     learned: list[Video] = []
     held_out: list[Video] = []
     for path in paths:
         for number, episode in enumerate(read_sound_pushes(path)):
             if is_for_validation(number):
-                held_out.append(_video(path, episode, device))
+                held_out.append(_video(path, episode, side, device))
             elif not has_held_out_pair(episode.names):
-                learned.append(_video(path, episode, device))
+                learned.append(_video(path, episode, side, device))
     sides = sorted({len(video.frames[0]) for video in (*learned, *held_out)})
     if len(sides) > 1:
         raise InvalidInput("sizes of the frames [px]", sides, "the same in all files")
@@ -169,7 +171,7 @@ def read_videos(paths: Sequence[Path], device: torch.device | str = "cpu") -> Vi
     return Videos(sides[0], learned, held_out)
 
 
-def _video(path: Path, episode: PushEpisode, device: torch.device | str) -> Video:
+def _video(path: Path, episode: PushEpisode, side: int | None, device: torch.device | str) -> Video:
     frames = episode.frames
     if frames is None:
         raise CorruptFile(path, "it holds no frames: 'osf collect pushes --images' keeps them")
@@ -178,8 +180,16 @@ def _video(path: Path, episode: PushEpisode, device: torch.device | str) -> Vide
     if len(episode.actions) < LEAST_STEPS:
         few = f"its episodes have {len(episode.actions)} actions, but {LEAST_STEPS} are needed to predict any"
         raise CorruptFile(path, few)
+    images = torch.as_tensor(frames)
+    if side is not None and side != frames.shape[1]:
+        if side > frames.shape[1] or frames.shape[1] % side:
+            raise InvalidInput(
+                "side of the frames [px]", side, f"one that divides {frames.shape[1]}, their recorded one"
+            )
+        pooled = functional.avg_pool2d(images.movedim(-1, 1).float(), frames.shape[1] // side)
+        images = pooled.round().byte().movedim(1, -1).contiguous()
     actions = torch.as_tensor(episode.actions, dtype=torch.float32)
-    return Video(torch.as_tensor(frames).to(device), actions.to(device), episode.names)
+    return Video(images.to(device), actions.to(device), episode.names)
 
 
 class Windows(NamedTuple):
@@ -356,6 +366,7 @@ class TrainFitVid:
         out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
         minutes: how long to train [min], without reading at the beginning and measuring at the end.
         iterations: instead of a time budget: that many steps of descent, repeatable on one machine.
+        side: of the images [px], to which recorded frames are averaged down; as they are if None.
         width: channels at full size.
         batch: windows in each step.
         frames: of a window, context included.
@@ -374,6 +385,7 @@ class TrainFitVid:
     out: Path
     minutes: float = 60.0
     iterations: int | None = None
+    side: int | None = None
     width: int = 4
     batch: int = 8
     frames: int = 12
@@ -422,6 +434,7 @@ def train_fitvid(config: TrainFitVid, library: AssetLibrary | None = None) -> It
     check_ranges(
         ("minutes", config.minutes, 0.01, 7 * 24 * 60),
         ("iterations", 1 if config.iterations is None else config.iterations, 1, 10_000_000),
+        ("side of the images [px]", 16 if config.side is None else config.side, 16, 1024),
         ("width of the network", config.width, 1, 256),
         ("batch", config.batch, 1, 10_000),
         ("frames of a window", config.frames, CONTEXT + 1, 1000),
@@ -433,7 +446,7 @@ def train_fitvid(config: TrainFitVid, library: AssetLibrary | None = None) -> It
     )
     device = pick_device(config.device)
     check_weights_place(config.out, _OWN_METRICS)
-    run = _Run(config, read_videos(config.data, device), device)
+    run = _Run(config, read_videos(config.data, config.side, device), device)
     run.resume()
     yield run.progress("Reading the frames")
     while run.share < 1:

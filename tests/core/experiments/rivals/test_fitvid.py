@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from safetensors.torch import load, save
 
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.experiments.rivals import fitvid
-from osfcore.experiments.rivals.train_fitvid import as_frames
+from osfcore.experiments.rivals.train_fitvid import Video, windows
 from tests.support.errors import about
 from tests.support.push_videos import square_video
 
@@ -32,17 +33,16 @@ def model(settings=TINY, seed=0, **more) -> fitvid.FitVidModel:
 
 def scene(side=16, steps=4, seed=0):
     frames, actions = square_video(side, steps, np.random.default_rng(seed))
-    video = as_frames(frames[None], torch.device("cpu"))
-    return video, torch.as_tensor(actions[None], dtype=torch.float32)
+    video = Video(torch.as_tensor(frames), torch.as_tensor(actions, dtype=torch.float32), ())
+    return windows([video], np.zeros(1, int), steps)
 
 
 @pytest.mark.slow
 def test_with_the_originals_channels_it_has_302_million_parameters():
     """With its 64 channels at 64 pixels; the variance that is never used is not counted."""
     with torch.device("meta"):
-        assert fitvid.FitVidModel(fitvid.FitVidSettings(side=64, width=64)).parameter_count == pytest.approx(
-            302e6, rel=0.03
-        )
+        original = fitvid.FitVidModel(fitvid.FitVidSettings(side=64, width=64, is_pooled=True))
+        assert original.parameter_count == pytest.approx(302e6, rel=0.03)
 
 
 @pytest.mark.parametrize(
@@ -161,6 +161,7 @@ def test_draws_have_the_mean_and_the_variance():
 
 SETTINGS = fitvid.FitVidSettings(side=16, width=1, features=6, hidden=8, latent=2)
 META = {"format": fitvid.FORMAT, "side": "16", "width": "1", "features": "6", "hidden": "8", "latent": "2"}
+META["is_pooled"] = "0"
 
 
 @pytest.fixture
@@ -185,6 +186,14 @@ def test_what_was_written_predicts_the_same(network, file):
     context, actions = np.random.default_rng(0).random((2, 16, 16, 3)), np.full((2, 3, 3), 0.1)
     np.testing.assert_allclose(again.predict(context, actions), network.predict(context, actions), atol=5e-3)
     assert file.stat().st_size < 2.6 * network.parameter_count + 40_000  # two bytes a parameter
+
+
+def test_a_file_of_an_earlier_version_has_the_mean_of_the_coarsest_map(tmp_path):
+    pooled = model(replace(SETTINGS, is_pooled=True)).eval()
+    fitvid.write_fitvid(tmp_path / "net.safetensors", pooled)
+    old = {name: value for name, value in META.items() if name != "is_pooled"}
+    (tmp_path / "net.safetensors").write_bytes(save(load((tmp_path / "net.safetensors").read_bytes()), old))
+    assert fitvid.read_fitvid(tmp_path / "net.safetensors").settings.is_pooled
 
 
 def damaged(file, **changes):
