@@ -325,7 +325,7 @@ def test_an_object_is_found_by_the_calibrated_camera(photos, tmp_path, capsys):
     assert np.abs(np.array(result["camera"]["T_world_camera"]) - T_WORLD_CAMERA.matrix()).max() < 3e-3
     assert np.linalg.norm(np.array(result["objects"][0]["position"]) - pose.position) < 0.01
     assert main([*call, "--focal", "560", "--out", str(tmp_path / "found.json")]) == 2
-    assert "--camera tells the focal length" in capsys.readouterr().err
+    assert "--camera has the focal length" in capsys.readouterr().err
 
 
 @pytest.mark.slow
