@@ -36,6 +36,7 @@ from osfcore.io.scene_file import CameraJson, ObjectJson
 Poses = tuple[tuple[str, Pose], ...]
 Files = Mapping[str, bytes | None]  # of a record by name; None for one that is not there
 _NO_FILES: Files = MappingProxyType({})
+_LONGEST_NAME = 255  # bytes of a file's name, on every file system in use
 
 
 class Kept(Protocol):
@@ -183,6 +184,7 @@ class RecordFolders(Generic[Record]):
 
     def _folder(self, name: str) -> Path:
         is_plain = is_file_name(name) and Path(name).name == name and not name.startswith(".")
+        is_plain = is_plain and len(name.encode()) <= _LONGEST_NAME
         if not is_plain or not (self._root / name).is_dir():
             raise NotThere(self._what)
         return self._root / name

@@ -139,8 +139,8 @@ def test_a_goal_that_was_removed_is_gone_with_its_image(store, tmp_path):
             call("a")
 
 
-@pytest.mark.parametrize("name", ["..", "../goals/a", "", "a/../a"])
-def test_names_that_lead_elsewhere_name_nothing(store, tmp_path, name):
+@pytest.mark.parametrize("name", ["..", "../goals/a", "", "a/../a", "a" * 256, "é" * 128])
+def test_names_that_lead_elsewhere_or_are_too_long_name_nothing(store, tmp_path, name):
     store.keep(goal(), PNG)
     with pytest.raises(UnknownName):
         store.remove(name)
