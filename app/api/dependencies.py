@@ -142,17 +142,28 @@ class ObjectCatalogue:
         self._lock = threading.Lock()
         self._seen_at = -_FRESH_S
         self._names: tuple[str, ...] = ()
+        self._damaged: dict[str, str] = {}
         self._labels: dict[str, str] = {name: info.label for name, info in CATALOGUE.items()}
 
     def names(self) -> tuple[str, ...]:
         """Objects on this machine."""
         with self._lock:
-            if time.monotonic() - self._seen_at > _FRESH_S:
-                self._names, self._seen_at = self._library.names(), time.monotonic()
-                for name in self._names:
-                    if name not in self._labels:
-                        self._labels[name] = self._library.label(name)
+            self._look()
             return self._names
+
+    def damaged(self) -> dict[str, str]:
+        """Return why other objects on this machine cannot be loaded, by name."""
+        with self._lock:
+            self._look()
+            return self._damaged
+
+    def _look(self) -> None:
+        if time.monotonic() - self._seen_at > _FRESH_S:
+            self._names, self._damaged = self._library.names(), self._library.damaged()
+            self._seen_at = time.monotonic()
+            for name in self._names:
+                if name not in self._labels:
+                    self._labels[name] = self._library.label(name)
 
     def outdate(self) -> None:
         """Look anew when next asked."""

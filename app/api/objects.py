@@ -59,12 +59,13 @@ _MESH_BODY = upload("model/gltf-binary", "application/zip")
 @router.get("")
 def list_all(services: ServicesDep) -> ObjectList:
     """List the objects of the catalogue and those that were added."""
-    names = dict.fromkeys((*CATALOGUE, *services.objects.names()))
+    there = services.objects.names()
+    names = dict.fromkeys((*CATALOGUE, *there))
     listed = []
     for name in names:
         with contextlib.suppress(OsfError):  # a damaged object of the user's must not hide the others
-            listed.append(_object(services, name))
-    damaged = [DamagedOut(id=name, reason=reason) for name, reason in services.runner.library.damaged().items()]
+            listed.append(_object(services, name, is_there=name in there))
+    damaged = [DamagedOut(id=name, reason=reason) for name, reason in services.objects.damaged().items()]
     return ObjectList(objects=listed, damaged=damaged)
 
 
@@ -93,7 +94,7 @@ async def add(
 def get(services: ServicesDep, name: Name) -> ObjectOut:
     """Return what is known of one object."""
     with named_in_path():
-        return _object(services, name)
+        return _object(services, name, is_there=services.runner.library.has(name))
 
 
 @router.delete("/{name}", response_class=Response, status_code=204, responses=problems(404, 409, 507))
@@ -120,14 +121,13 @@ def thumbnail(
     return Response(png, media_type="image/png", headers={"Cache-Control": lasting})
 
 
-def _object(services: Services, name: str) -> ObjectOut:
+def _object(services: Services, name: str, *, is_there: bool) -> ObjectOut:
     library = services.runner.library
     info = library.info(name)
-    try:
-        library.check(name)
-        size_m, version = library.size_m(name).tolist(), library.digest(name)[:12]
-    except OsfError:  # not fetched, or damaged
-        size_m, version = None, None
+    size_m, version = None, None
+    if is_there:
+        with contextlib.suppress(OsfError):  # deleted or damaged in this moment
+            size_m, version = library.size_m(name).tolist(), library.digest(name)[:12]
     return ObjectOut(
         name=info.name,
         label=info.label,
