@@ -94,11 +94,7 @@ def test_what_was_predicted_is_taken_over_method_by_method(compared, library, mo
 
 @pytest.mark.parametrize(
     ("changes", "subject"),
-    [
-        ({"objects": 4}, "number of objects"),
-        ({"steps": 500}, "steps"),
-        ({"methods": ()}, "methods"),
-    ],
+    [({"objects": 4}, "number of objects"), ({"steps": 500}, "steps"), ({"methods": ()}, "methods")],
 )
 def test_a_mistake_is_found_before_anything_is_written(library, tmp_path, changes, subject):
     write_weights(tmp_path)
