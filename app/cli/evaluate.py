@@ -186,7 +186,7 @@ class EvaluatePublishedCommand(ParallelEvaluation):
     objects: int = 3
     """Objects in a scene."""
     fields: Literal["paper", "ours"] = "paper"
-    """Whose appearance is compared with the images; ours take a seventh of the time."""
+    """Whose appearance is compared with the images; ours are drawn faster."""
     settings: tuple[str, ...] = ()
     """Some of the settings, such as '24 starts'; all by default."""
     families: tuple[Literal["any", "upright"], ...] = ("any", "upright")

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from dataclasses import fields as fields_of
 from functools import partial
 from typing import Any
 
@@ -37,6 +38,7 @@ from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.inspection.contact_sheet import image_grid
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream
+from osfcore.world.scenes import Conditions
 from osfcore.world.tasks import Draw, draw_scene
 
 REPORT_FILE, CHART_FILE, IMAGES_FILE = "relighting.json", "relighting.png", "relighting_scene.png"
@@ -51,7 +53,7 @@ class CompareRelighting(CompareImages):
 
     Attributes:
         elevations_deg: of the lights above the table.
-        factor: name of what differs from the usual world, such as "objects_shiny"; "" for nothing.
+        factor: name of what differs from the usual lamp, table or renderer, such as "objects_shiny"; "" for nothing.
     """
 
     elevations_deg: tuple[float, ...] = ELEVATIONS_DEG
@@ -80,8 +82,7 @@ def compare_relighting(
     if not elevations or not MIN_LIGHT_ELEVATION_DEG <= elevations[0] <= elevations[-1] <= 90:
         allowed = f"one or more between {MIN_LIGHT_ELEVATION_DEG:g} and 90"
         raise InvalidInput("elevations of the light [deg]", ", ".join(f"{e:g}" for e in elevations) or "none", allowed)
-    if config.factor:
-        factor_named(config.factor)  # an unknown one is refused before any work
+    _conditions(config.factor)  # what cannot be shown is refused before any work
     config = checked(replace(config, elevations_deg=elevations), FIELD_METHODS, fields, assets)
     names = config.names or ()
 
@@ -90,7 +91,7 @@ def compare_relighting(
         cache = TaskCache(config.folder / "relighting" / cell / method)
         draw = draw_scene(names, config.objects, config.seed, number, Stream.RELIT_SCENE)
         shown = shown_circumstances(draw, (method,), fields, assets, config.data_dir, config.size)
-        given = {"version": VERSION, "elevations_deg": elevations, "factor": config.factor, **shown}
+        given = {"version": VERSION, "elevations_deg": elevations, **shown}
         return Piece(f"{number:04d}", cache, given, partial(show_relit, config, draw, method, fields, assets))
 
     about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "size", "factor")}
@@ -124,8 +125,7 @@ def show_relit(
     """
     azimuth = float(np.arctan2(draw.light.direction[1], draw.light.direction[0]))
     lights = [Light.from_angles(azimuth, np.deg2rad(elevation)) for elevation in config.elevations_deg]
-    conditions = factor_named(config.factor).conditions if config.factor else None
-    truths = simulate_relit(draw, lights, assets, default_cameras(config.size), conditions)
+    truths = simulate_relit(draw, lights, assets, default_cameras(config.size), _conditions(config.factor))
     renderer = load_appearance(method, draw.names, fields, config.data_dir).together
     scenes = [compare_scene(truth, render_scene(renderer, truth)) for truth in truths]
     figures = [figures_of(scene) for scene in scenes]
@@ -136,6 +136,21 @@ def show_relit(
             for n in sorted({0, len(scenes) // 2, len(scenes) - 1})
         ),
     )
+
+
+def _conditions(factor: str) -> Conditions | None:
+    """Return the conditions of a factor, None for none.
+
+    Raises:
+        UnknownName: if there is none of that name.
+        InvalidInput: if it differs in more than its conditions, of which nothing would be seen here.
+    """
+    if not factor:
+        return None
+    found = factor_named(factor)
+    if any(getattr(found, entry.name) != entry.default for entry in fields_of(found) if entry.name != "conditions"):
+        raise InvalidInput("factor", factor, "one that changes lamp, table or renderer alone, such as objects_shiny")
+    return found.conditions
 
 
 def _picture(results: Mapping[str, TaskResult]) -> UInt8[np.ndarray, "H W 3"]:

@@ -14,12 +14,12 @@ Deviations from the published program: channels start with 4 at full size, where
 stage; there are as many stages as leave 8 x 8 pixels to the coarsest maps, whatever the images' size. A frame's
 vector is a linear function of its whole coarsest map, not of the map's mean: of so few channels the mean does not
 tell where anything is. The network that ships has the mean, and ignores actions (docs/evaluation.md). The frame
-predictor's last layer begins 30 times larger, for else its sigmoid begins within 0.001 of a half and says nothing to
-the decoder. Batch norm takes its statistics over all steps of a batch at once, not step by step. The frame predictor
-has no variance, which the original computes and never uses. The decoder changes the last context frame, where the
-original's draws a new one. Encoder and decoder may compute in bfloat16. Predictions take the skip connections from
-the last context frame, as training does; the original takes those of the first one there. Actions are in units of the
-highest speed.
+predictor's last layer begins 30 times larger, for else its sigmoid begins close to a half everywhere and says nothing
+to the decoder. Batch norm takes its statistics over all steps of a batch at once, not step by step. The frame
+predictor has no variance, which the original computes and never uses. The decoder changes the last context frame,
+where the original's draws a new one. Encoder and decoder may compute in bfloat16. Predictions take the skip
+connections from the last context frame, as training does; the original takes those of the first one there. Actions
+are in units of the highest speed.
 """
 
 from __future__ import annotations

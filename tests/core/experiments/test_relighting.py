@@ -76,8 +76,8 @@ def test_what_cannot_be_compared_is_refused(asked, library, tmp_path):
         config = replace(asked, folder=tmp_path / "out", **{what: wrong})
         with pytest.raises(InvalidInput, check=about(what.removesuffix("_deg"))):
             next(relit.compare_relighting(config, FieldLibrary(None), library))
-    with pytest.raises(UnknownName):
-        next(
-            relit.compare_relighting(replace(asked, folder=tmp_path / "out", factor="fog"), FieldLibrary(None), library)
-        )
+    for factor, error in (("camera_shifted", InvalidInput), ("fog", UnknownName)):  # nothing of either would be seen
+        config = replace(asked, folder=tmp_path / "out", factor=factor)
+        with pytest.raises(error):
+            next(relit.compare_relighting(config, FieldLibrary(None), library))
     assert not (tmp_path / "out").exists()
