@@ -337,21 +337,24 @@ class EvaluateMpcCommand(ParallelEvaluation):
 class EvaluateRelightingCommand(ParallelEvaluation):
     """Scenes under lights of many elevations, true poses and light given, as each method shows them."""
 
-    methods: tuple[Literal["ours", "paper", "nerf"], ...] = ("ours", "paper", "nerf")
-    """Our fields; KiloOSFs as published; compositional NeRFs, which know of no light."""
+    methods: tuple[Literal["ours", "paper", "nerf", "nerf_fitted"], ...] = ("ours", "paper", "nerf", "nerf_fitted")
+    """Our fields; KiloOSFs as published; compositional NeRFs, which know of no light; these with each object and the
+    table as bright as fits the true images best."""
     objects: int = 3
     """Objects in a scene."""
     elevations: tuple[float, ...] = (5, 10, 20, 30, 45, 60, 75, 90)
     """Of the lights above the table [deg]."""
     factor: str = ""
     """One thing in which the world differs from what fields learned, such as objects_shiny or renderer_tiny."""
+    sky: bool = False
+    """Show scenes also as they are on average under lights from all over the sky, which is what NeRFs learn."""
 
     def _steps(self, executor: Executor | None) -> Iterator[Any]:
         from osfcore.experiments.relighting import CompareRelighting, compare_relighting
 
         config = CompareRelighting(
             self.folder, self.data_dir, self.names, self.tasks, self.seed, self.methods, self.objects, self.elevations,
-            self.factor,
+            self.factor, self.sky,
         )  # fmt: skip
         return compare_relighting(config, self.trained, self.assets, executor)
 

@@ -40,15 +40,24 @@ from osfcore.world.tasks import Draw
 
 # Methods that show scenes: which objects each one knows, and how it shows them.
 #
-#     ours   relightable fields as they ship.
-#     paper  KiloOSFs as published.
-#     nerf   compositional NeRFs: fields that know of no light.
+#     ours         relightable fields as they ship.
+#     paper        KiloOSFs as published.
+#     nerf         compositional NeRFs: fields that know of no light.
+#     nerf_fitted  the same, each object and the table as bright as fits the true images best.
 
 
 OURS = "ours"  # what others are compared with
-FIELD_METHODS = (OURS, "paper", "nerf")
+_UNLIT = ("nerf", "nerf_fitted")
+FIELD_METHODS = (OURS, "paper", *_UNLIT)
 TITLES: Mapping[str, str] = MappingProxyType(
-    {"copied": "last frame", OURS: "ours", "paper": "as published", "nerf": "NeRF", "fitvid": "FitVid"}
+    {
+        "copied": "last frame",
+        OURS: "ours",
+        "paper": "as published",
+        "nerf": "NeRF",
+        "nerf_fitted": "NeRF, brightness fitted",
+        "fitvid": "FitVid",
+    }
 )  # in charts and beside images
 
 
@@ -95,7 +104,7 @@ def known_names(method: str, fields: FieldLibrary, data_dir: Path | None) -> tup
     """Return the objects that a method has a field of; ours for methods without fields of their own."""
     if method == "paper":
         return paper_field_names(data_dir)
-    return (nerf_library(data_dir) if method == "nerf" else fields).names()
+    return (nerf_library(data_dir) if method in _UNLIT else fields).names()
 
 
 def field_path(method: str, name: str, fields: FieldLibrary, data_dir: Path | None) -> Path:
@@ -106,7 +115,7 @@ def field_path(method: str, name: str, fields: FieldLibrary, data_dir: Path | No
     """
     if method == "paper":
         return paper_field_path(name, data_dir)
-    return (nerf_library(data_dir) if method == "nerf" else fields).info(name).path
+    return (nerf_library(data_dir) if method in _UNLIT else fields).info(name).path
 
 
 def load_appearance(method: str, names: Iterable[str], fields: FieldLibrary, data_dir: Path | None) -> ObjectModels:
@@ -124,7 +133,7 @@ def load_appearance(method: str, names: Iterable[str], fields: FieldLibrary, dat
     """
     if method == "paper":
         return load_paper_appearance(names, fields, data_dir)
-    if method == "nerf":
+    if method in _UNLIT:
         return load_nerf_appearance(names, fields, data_dir)
     return ObjectModels({name: fields.load(name) for name in names}, fields.load_table())
 
@@ -243,7 +252,7 @@ def compare(
         measures: names of figures; a result has a list of each along x, with None where there is no figure.
         spans: indices along x over which means are reported, by name.
         x: axis along which is measured.
-        places: on it.
+        places: on it; NaN for what has none and is left out of the charts.
         picture: draws the first results of the methods.
 
     Raises:
@@ -307,14 +316,16 @@ def chart_of(tables: Tables, key: str, x: Axis, places: Sequence[float], label: 
         tables: of the methods.
         key: of the measure.
         x: axis along which it was measured.
-        places: on it.
+        places: on it; what has none, NaN, is not drawn.
         label: of the measure, with its unit.
         tick: the axis of the measure begins at a multiple of it.
     """
     means = {m: np.array([_mean(column) for column in part[key].T], float) for m, part in tables.items()}
     lowest = min(float(np.nanmin(values, initial=np.inf)) for values in means.values())
     low = tick * np.floor(lowest / tick) if np.isfinite(lowest) else 0.0
-    curves = [Curve(TITLES[method], np.asarray(places, float), values, dots=True) for method, values in means.items()]
+    at = np.asarray(places, float)
+    known = np.isfinite(at)
+    curves = [Curve(TITLES[method], at[known], values[known], dots=True) for method, values in means.items()]
     return Chart("", x, Axis(label, low), curves)
 
 

@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 from osfcore.errors import InvalidInput
 from osfcore.experiments.charts import Axis
 from osfcore.experiments.factors import factor_named
-from osfcore.experiments.fields import MEASURES, compare_scene, figures_of, render_scene, simulate_relit
+from osfcore.experiments.fields import MEASURES, SCENE_QUALITY, compare_scene, figures_of, render_scene, simulate_relit
 from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult
 from osfcore.experiments.images import (
     FIELD_METHODS,
@@ -31,19 +31,23 @@ from osfcore.experiments.images import (
     load_appearance,
     shown_circumstances,
 )
+from osfcore.experiments.rivals.nerf import with_fitted_brightness
 from osfcore.experiments.statistics import mean
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import MIN_LIGHT_ELEVATION_DEG, Light
+from osfcore.geometry.poses import fibonacci_sphere
 from osfcore.inspection.contact_sheet import image_grid
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream
+from osfcore.render.types import SceneBatch
 from osfcore.world.scenes import Conditions
 from osfcore.world.tasks import Draw, draw_scene
 
 REPORT_FILE, CHART_FILE, IMAGES_FILE = "relighting.json", "relighting.png", "relighting_scene.png"
 ELEVATIONS_DEG = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 75.0, 90.0)
-ALL = "all"  # the span of all elevations
+ALL, SKY = "all", "sky"  # the span of all elevations, and that of the whole sky
+_SKY_LIGHTS = 16
 VERSION = 1  # raised by hand when figures may change
 
 
@@ -54,10 +58,13 @@ class CompareRelighting(CompareImages):
     Attributes:
         elevations_deg: of the lights above the table.
         factor: name of what differs from the usual lamp, table or renderer, such as "objects_shiny"; "" for nothing.
+        sky: whether scenes are also shown as they are on average under lights from all over the sky, which is what
+            fields without light learn.
     """
 
     elevations_deg: tuple[float, ...] = ELEVATIONS_DEG
     factor: str = ""
+    sky: bool = False
 
 
 def compare_relighting(
@@ -92,14 +99,17 @@ def compare_relighting(
         draw = draw_scene(names, config.objects, config.seed, number, Stream.RELIT_SCENE)
         shown = shown_circumstances(draw, (method,), fields, assets, config.data_dir, config.size)
         given = {"version": VERSION, "elevations_deg": elevations, **shown}
+        given |= {"sky": _SKY_LIGHTS} if config.sky else {}
         return Piece(f"{number:04d}", cache, given, partial(show_relit, config, draw, method, fields, assets))
 
     about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "size", "factor")}
     spans = {ALL: range(len(elevations)), **{f"{elevation:g}": [n] for n, elevation in enumerate(elevations)}}
+    spans |= {SKY: [len(elevations)]} if config.sky else {}
+    places = (*elevations, *([np.nan] if config.sky else []))
     yield from compare(
         config, piece, executor, files=(REPORT_FILE, CHART_FILE, IMAGES_FILE),
         about={**about, "names": list(names), "elevations_deg": list(elevations)}, measures=MEASURES, spans=spans,
-        x=Axis("light above the table [deg]", 0, 90), places=elevations, picture=_picture,
+        x=Axis("light above the table [deg]", 0, 90), places=places, picture=_picture,
     )  # fmt: skip
 
 
@@ -116,8 +126,8 @@ def show_relit(
         assets: meshes for the simulator.
 
     Returns:
-        For each measure its means over the four cameras, one for each elevation; comparisons of the first camera
-        under the lowest, the middle and the highest light.
+        For each measure its means over the four cameras, one for each elevation and one for the sky if asked for;
+        comparisons of the first camera under the lowest, the middle and the highest light.
 
     Raises:
         NoRoom: if the objects do not fit side by side.
@@ -125,15 +135,29 @@ def show_relit(
     """
     azimuth = float(np.arctan2(draw.light.direction[1], draw.light.direction[0]))
     lights = [Light.from_angles(azimuth, np.deg2rad(elevation)) for elevation in config.elevations_deg]
-    truths = simulate_relit(draw, lights, assets, default_cameras(config.size), _conditions(config.factor))
+    lowest = np.sin(np.deg2rad(MIN_LIGHT_ELEVATION_DEG))
+    sky = [Light(one) for one in fibonacci_sphere(2 * _SKY_LIGHTS) if one[2] > lowest] if config.sky else []
+    cameras, conditions = default_cameras(config.size), _conditions(config.factor)
+    truths = list(simulate_relit(draw, [*lights, *sky], assets, cameras, conditions))
     renderer = load_appearance(method, draw.names, fields, config.data_dir).together
-    scenes = [compare_scene(truth, render_scene(renderer, truth)) for truth in truths]
+    images = [render_scene(renderer, truth) for truth in truths]
+    if sky:
+        rest, nowhere = slice(len(lights), None), np.zeros_like(truths[0].shadows)
+        average = np.mean([truth.images for truth in truths[rest]], axis=0)
+        truths[rest] = [replace(truths[-1], images=average, shadows=nowhere)]
+        images[rest] = [np.mean(images[rest], axis=0)]
+    if method == "nerf_fitted":
+        whole = renderer.render(SceneBatch.of(truths[0].state), cameras, quality=SCENE_QUALITY, outputs={"opacity"})
+        assert whole.opacity is not None  # it was asked for
+        pairs = zip(images, truths, strict=True)
+        images = [with_fitted_brightness(shown, whole.opacity[0], truth.images) for shown, truth in pairs]
+    scenes = [compare_scene(truth, shown) for truth, shown in zip(truths, images, strict=True)]
     figures = [figures_of(scene) for scene in scenes]
     return TaskResult(
         {key: [mean(one[key]) for one in figures] for key in MEASURES},
         tuple(
             replace(scenes[n][0].comparison, label=f"{config.elevations_deg[n]:g} deg")
-            for n in sorted({0, len(scenes) // 2, len(scenes) - 1})
+            for n in sorted({0, len(lights) // 2, len(lights) - 1})
         ),
     )
 

@@ -8,7 +8,8 @@ Deviations from the published model: fields are composed by the object poses tha
 latent vectors that an encoder makes of images and masks, and pushes are predicted by our dynamics instead of a network
 over these vectors; each field learns from images of its object alone, 385 under as many lights, instead of from scenes
 of 1,000 trajectories. What differs from our method: fields, table, no shadows, and no light is estimated; the pusher is
-drawn as ours.
+drawn as ours. A latent vector can hold how brightly an object is lit; here that may be fitted to the true image
+(`with_fitted_brightness`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from scipy.optimize import nnls
 
 from osfcore.control.estimators import SceneModels
 from osfcore.estimation.objective import ObjectModels
@@ -28,6 +30,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
 from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import fibonacci_sphere
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import EXACT, Quality, Rendered, SceneBatch
 
@@ -67,12 +70,30 @@ def mean_table(table: TableField) -> TableField:
 
     Least squares would find it for a table without light, from images under lights that are uniform over the sky.
     """
-    z = (np.arange(_LIGHTS) + 0.5) / _LIGHTS  # equal areas of the hemisphere, along a spiral
-    angle = np.pi * (1 + 5**0.5) * np.arange(_LIGHTS)
-    radius = np.sqrt(1 - z**2)
-    lights = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    lights = fibonacci_sphere(2 * _LIGHTS)[:_LIGHTS]  # its upper half
     ambient = (table.ambient + table.direct(lights).mean(axis=0)).astype(np.float32)
     return replace(table, ambient=ambient, w2=np.zeros_like(table.w2), b2=np.zeros_like(table.b2))
+
+
+def with_fitted_brightness(
+    shown: Float[np.ndarray, "V h w 3"], opacity: Float[np.ndarray, "V N h w"], truth: Float[np.ndarray, "V h w 3"]
+) -> Float[np.ndarray, "V h w 3"]:
+    """Scale each object and the table by a factor of its own, so that images come as close to the truth as they can.
+
+        min_g |I_true - I (sum_n o_n g_n + (1 - sum_n o_n) g_table)|^2,    g >= 0
+
+    This is what an encoder of images could tell of a scene's brightness at best, for it is read off the truth.
+
+    Args:
+        shown: images (I).
+        opacity: how much of each pixel shows each object (o).
+        truth: what they should look like.
+    """
+    shares = np.concatenate([opacity, 1 - opacity.sum(axis=1, keepdims=True)], axis=1)
+    parts = np.moveaxis(shown[:, None] * shares[..., None], 1, -1)  # (V, h, w, 3, N + 1)
+    columns = parts.reshape(-1, parts.shape[-1]).astype(float)
+    gains, _ = nnls(columns.T @ columns, columns.T @ truth.reshape(-1))
+    return np.clip(parts @ gains, 0, 1)
 
 
 def nerf_library(data_dir: Path | None) -> FieldLibrary:

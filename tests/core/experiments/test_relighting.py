@@ -17,8 +17,8 @@ def asked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("relighting")
     write_nerfs(folder / "data")
     return relit.CompareRelighting(
-        folder / "out", folder / "data", SOLIDS, tasks=1, methods=("nerf", "ours"), objects=2, elevations_deg=(90, 15),
-        size=32,
+        folder / "out", folder / "data", SOLIDS, tasks=1, methods=("nerf_fitted", "nerf", "ours"), objects=2,
+        elevations_deg=(90, 15), sky=True, size=32,
     )  # fmt: skip
 
 
@@ -28,18 +28,21 @@ def steps(asked, library):
 
 
 def test_a_scene_is_shown_by_each_method_under_each_light(asked, steps):
-    assert [(step.done, step.total, step.report is None) for step in steps] == [(n, 2, n < 2) for n in range(3)]
+    assert [(step.done, step.total, step.report is None) for step in steps] == [(n, 3, n < 3) for n in range(4)]
     report = steps[-1].report
     assert json.loads((asked.folder / relit.REPORT_FILE).read_text()) == report
     assert report["elevations_deg"] == [15, 90]
-    assert list(report["methods"]) == ["ours", "nerf"]
+    assert list(report["methods"]) == ["ours", "nerf", "nerf_fitted"]
     for figures in report["methods"].values():
         assert set(figures) == set(MEASURES)
-        assert all(len(row["along"]) == 2 for row in figures.values())
-        assert set(figures["psnr"]["spans"]) == {"all", "15", "90"}
-    ours, nerf = (report["methods"][method]["psnr"]["spans"]["all"]["mean"] for method in ("ours", "nerf"))
+        assert all(len(row["along"]) == 3 for row in figures.values())
+        assert set(figures["psnr"]["spans"]) == {"all", "15", "90", "sky"}
+    means = {name: figures["psnr"]["spans"] for name, figures in report["methods"].items()}
+    ours, nerf, fitted = (means[method]["all"]["mean"] for method in ("ours", "nerf", "nerf_fitted"))
     assert report["against"]["nerf"]["psnr"]["all"]["difference"] == pytest.approx(ours - nerf, abs=1e-3)
-    assert ours > nerf + 5  # fields without light do not know how bright the table is
+    assert ours > fitted + 2  # no brightness makes up for shadows
+    assert fitted > nerf + 2  # fields without light do not know how bright the table is
+    assert all(means["nerf"]["sky"]["mean"] > means["nerf"][one]["mean"] for one in ("15", "90"))  # what they learned
     height, width, _ = cv2.imread(str(asked.folder / relit.IMAGES_FILE)).shape
     assert height > 2 * 32  # lights
     assert width > 3 * 32  # simulator and methods

@@ -1,6 +1,6 @@
 import numpy as np
 
-from osfcore.experiments.rivals.nerf import UnlitRenderer, load_nerf_appearance, mean_table
+from osfcore.experiments.rivals.nerf import UnlitRenderer, load_nerf_appearance, mean_table, with_fitted_brightness
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.fields.kiloosf import without_light
 from osfcore.geometry.cameras import goal_camera
@@ -59,3 +59,14 @@ def test_the_mean_table_is_the_mean_over_lights():
     np.testing.assert_allclose(unlit.ambient, table.ambient + table.direct(lights).mean(axis=0), atol=0.01)
     np.testing.assert_array_equal(unlit.direct(lights[:9]), 0)
     assert unlit.albedo is table.albedo
+
+
+def test_brightness_that_was_changed_is_found_again():
+    rng = np.random.default_rng(0)
+    opacity = rng.dirichlet(np.ones(3), (2, 8, 8)).transpose(0, 3, 1, 2)[:, :2]  # two objects, and the table between
+    shown = rng.uniform(0.1, 0.4, (2, 8, 8, 3))
+    shares = np.concatenate([opacity, 1 - opacity.sum(axis=1, keepdims=True)], axis=1)
+    truth = shown * np.einsum("vnhw,n->vhw", shares, [0.3, 2.0, 1.2])[..., None]
+    np.testing.assert_allclose(with_fitted_brightness(shown, opacity, truth), truth, atol=1e-9)
+    negative = with_fitted_brightness(shown, opacity, -truth)
+    np.testing.assert_allclose(negative, 0, atol=1e-9)  # nothing is darker than black
