@@ -49,6 +49,7 @@ class Stream(IntEnum):
     PHOTO_PLANE = 91  # of the table, from measured depth
     FACTOR_FRAME = 92  # what a factor leaves to chance in a measured first frame: wood, errors of cameras, noise
     PAPER_SCENE = 94  # scenes whose poses and light are estimated as published, under choices that its text leaves open
+    UNROLLED_SCENE = 96  # scenes whose estimates are shown step by step
     LAMP_SCENE = 95  # scenes under lamps that are estimated, and the photographs of them
 
 

@@ -444,7 +444,7 @@ class EvaluatePhotosCommand(DataCommand):
 
 @dataclass(frozen=True)
 class ReproduceCommand(DataCommand):
-    """The paper's figures 5, 6 and 7, its rivals, and what else there is to know, as one HTML page.
+    """The paper's figures, its rivals, and what else there is to know, as one HTML page.
 
     A killed run goes on when started again. Without --quick it takes days on two cores.
     """
@@ -454,8 +454,12 @@ class ReproduceCommand(DataCommand):
     quick: bool = False
     """A look in a quarter of an hour on two cores: three tasks a cell, short episodes, fewer cells."""
     only: tuple[
-        Literal["relighting", "video", "methods", "families", "ablations", "ladder", "factors", "attribution"], ...
-    ] = ()
+        Literal[
+            "estimation", "relighting", "dynamics", "video", "photos",
+            "methods", "families", "ablations", "ladder", "factors", "attribution",
+        ],
+        ...,
+    ] = ()  # fmt: skip
     """Parts of the report; all by default."""
     tasks: int | None = None
     """Tasks of each cell; 3 with --quick, else 100 of the methods with three objects and 50 of all others."""
@@ -466,6 +470,8 @@ class ReproduceCommand(DataCommand):
     seed: Seed = 0
     names: tuple[str, ...] | None = None
     """Objects; by default all of which every method has a field."""
+    photos: Path | None = None
+    """Folder of photographs as 'osf eval photos' takes them; without one the part on photographs is left out."""
     workers: int = 2
     """Processes that work side by side."""
     cluster: str | None = None
@@ -481,7 +487,7 @@ class ReproduceCommand(DataCommand):
         called = shlex.join(["osf", *sys.argv[1:]])
         about = paper.About(date.today().isoformat(), f"{os.cpu_count()} cores, {system}", called, self.seed, ())
         config = paper.Reproduce(
-            self.out, self.data_dir, about, scale, self.quick, self.only or paper.PARTS, self.names
+            self.out, self.data_dir, about, scale, self.quick, self.only or paper.PARTS, self.names, self.photos
         )
         with worker_pool(self.workers, self.cluster) as executor:
             report = report_of(paper.reproduce(config, self.trained, self.assets, executor))

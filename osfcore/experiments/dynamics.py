@@ -384,6 +384,7 @@ def report_json(report: DynamicsReport) -> dict[str, Any]:
     result["still_windows_30"] = len(still)
     for horizon in _REPORTED:
         result[f"constant_mm_{horizon}"] = _median(_moved(main, "constant", horizon))
+        result[f"constant_deg_{horizon}"] = _median(_moved(main, "constant", horizon, deg=True))
         result[f"analytic_mm_{horizon}"] = _median(_moved(main, "analytic", horizon))
         result[f"analytic_deg_{horizon}"] = _median(_moved(main, "analytic", horizon, deg=True))
     result["rollout_steps_per_s"] = round(report.rollout_steps_per_s)

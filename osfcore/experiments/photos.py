@@ -398,8 +398,7 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ev
         ("error of masks [px]", config.mask_error_px, 0, _MOST_MASK_PX),
         ("starts of each object", config.repeats, 1, _MOST_REPEATS),
     )
-    described = sorted([*config.data.glob(PHOTO_FILE), *config.data.glob(f"*/{PHOTO_FILE}")])
-    scenes = [read_scene(path.parent) for path in described]
+    scenes = [read_scene(path.parent) for path in described(config.data)]
     lamps = sorted(path.parents[1] for path in config.data.glob(f"**/{_MIRROR}/{_MIRROR}.mask.png"))
     known = set(fields.names())
     asked = [(scene, _names(config, scene, known)) for scene in scenes]
@@ -427,6 +426,21 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ev
     report = photo_report(scores, lamp_errors, without)
     write_json(config.folder / "report.json", report)
     yield EvaluationStep(len(cases), len(cases), "Everything is measured", report)
+
+
+def starts_of(data: Path) -> tuple[str, ...]:
+    """Return what searches in a folder of photographs may begin with: "none", then all sources but the references.
+
+    Raises:
+        CorruptFile: as files are.
+    """
+    sources = {source for path in described(data) for source in read_scene(path.parent).poses}
+    return (NONE, *sorted(sources - {GROUND_TRUTH, REFINED}))
+
+
+def described(data: Path) -> list[Path]:
+    """Return the photo.json of a folder of photographs, and those of the folders in it."""
+    return sorted([*data.glob(PHOTO_FILE), *data.glob(f"*/{PHOTO_FILE}")])
 
 
 def _names(config: EvaluatePhotos, scene: PhotoFolder, known: set[str]) -> list[str]:

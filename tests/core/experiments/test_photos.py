@@ -1,4 +1,5 @@
 import json
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -6,12 +7,12 @@ import numpy as np
 import pytest
 
 from osfcore.errors import CorruptFile, InvalidInput
-from osfcore.experiments.photos import EvaluatePhotos, box_and_click, evaluate_photos, read_lamps, read_scene
+from osfcore.experiments.photos import EvaluatePhotos, box_and_click, evaluate_photos, read_lamps, read_scene, starts_of
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import rotate
 from osfcore.io.image_file import write_png
 from tests.support.errors import about
-from tests.support.photographs import INTRINSICS, NAME, take
+from tests.support.photographs import INTRINSICS, NAME, take, write_photo
 
 SIDE = 96
 AZIMUTHS = np.arange(10) * 2.4
@@ -24,16 +25,9 @@ def scene(tmp_path_factory):
     taken = take({NAME: library.load(NAME)})
     folder = tmp_path_factory.mktemp("photos") / "desk"
     folder.mkdir()
-    write_png(folder / "photo.png", taken.encoded)
-    write_png(folder / "mask.png", 255 * taken.photo.masks[NAME].astype(np.uint8))
     depth = np.where(taken.photo.masks[NAME], taken.depth, depth_of_table(taken, library.load(NAME)))
     cv2.imwrite(str(folder / "depth.png"), np.round(depth * 1e4).astype(np.uint16))
-    pose = {"position": taken.pose.position.tolist(), "quaternion": taken.pose.quaternion.tolist()}
-    known = {
-        "image": "photo.png", "encoding": "sRGB", "K": INTRINSICS.tolist(), "masks": {NAME: "mask.png"},
-        "depth": "depth.png", "depth_unit_m": 1e-4, "poses_camera_object": {"ground_truth": {NAME: pose}},
-    }  # fmt: skip
-    (folder / "photo.json").write_text(json.dumps(known))
+    write_photo(folder, taken, depth="depth.png", depth_unit_m=1e-4)
     return folder
 
 
@@ -113,6 +107,16 @@ def test_the_table_is_where_depth_says(scene):
     points = read_scene(scene).table_points()
     centred = points - points.mean(axis=0)
     assert np.linalg.svd(centred, compute_uv=False)[2] / np.sqrt(len(points)) < 1e-3
+
+
+def test_searches_may_begin_with_any_source_but_the_references(scene, tmp_path):
+    shutil.copytree(scene, tmp_path / "desk")
+    assert starts_of(tmp_path) == ("none",)
+    known = json.loads((scene / "photo.json").read_text())
+    poses = known["poses_camera_object"]["ground_truth"]
+    known["poses_camera_object"] |= {"posecnn_raw": poses, "posecnn_refined_with_depth": poses}
+    (tmp_path / "desk" / "photo.json").write_text(json.dumps(known))
+    assert starts_of(tmp_path) == ("none", "posecnn_raw")
 
 
 def test_what_cannot_be_measured_is_refused(scene, tmp_path):

@@ -24,6 +24,8 @@ from osfcore.experiments.reproduction.reproduction import (
 from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, write_fitvid
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.planning.mppi import PlanSettings
+from tests.support.photographs import NAME as BOX
+from tests.support.photographs import take, write_photo
 
 NAME = "005_tomato_soup_can"
 SMALLEST = replace(
@@ -96,12 +98,38 @@ def test_images_are_compared_as_well(library, tmp_path):
     (asked.data_dir / "fitvid.safetensors").unlink()  # the package's predicts in its stead
     report = reproduced(library, asked)[-1].report
     page = (asked.folder / PAGE_FILE).read_text()
-    assert list(report["relighting"]["methods"]) == ["ours", "paper", "nerf"]
+    assert list(report["relighting"]["methods"]) == ["ours", "paper", "nerf", "nerf_fitted"]
     assert list(report["video"]["methods"]) == ["copied", "ours", "paper", "nerf", "fitvid"]
     assert page.count("data:image/png;base64,") == 4
     gap = report["relighting"]["against"]["nerf"]["psnr"]["all"]["difference"]
     assert gap > 3
     assert f">{gap:.3g}<" in page  # of one scene there is no interval
+
+
+@pytest.mark.slow
+def test_estimates_and_predicted_poses_are_reported(library, tmp_path):
+    few = replace(SMALLEST, frames=1, pushes=1)
+    names = ("003_cracker_box", NAME, "009_gelatin_box")
+    report = reproduced(library, config(tmp_path, parts=("estimation", "dynamics"), scale=few, names=names))[-1].report
+    page = (tmp_path / "out" / PAGE_FILE).read_text()
+    assert page.count("data:image/png;base64,") == 4
+    for method in ("ours", "paper"):
+        assert report["estimation"]["methods"][method]["frames"] == 1
+        error = report["dynamics"][method]["median_mm_4"]
+        assert f">{error:.3g}<" in page
+    assert "<td>no motion</td>" in page
+
+
+@pytest.mark.slow
+def test_photographs_are_reported_where_there_are_any(library, tmp_path):
+    pictured = tmp_path / "photos"
+    (pictured / "desk").mkdir(parents=True)
+    write_photo(pictured / "desk", take({BOX: FieldLibrary(None).load(BOX)}))
+    asked = config(tmp_path, parts=("photos",), photos=pictured)
+    report = reproduced(library, asked)[-1].report
+    assert [score["scene"] for score in report["photos"]["none"]["scores"]] == ["desk"]
+    assert "<td>desk</td>" in (asked.folder / PAGE_FILE).read_text()
+    assert "photos" not in reproduced(library, replace(asked, photos=None))[-1].report
 
 
 # Sections
