@@ -163,6 +163,8 @@ class LampScore:
         std_deg: its estimated standard deviation.
         true_m: distance from there; None for a distant lamp.
         distance_m: that was estimated; None if it cannot be determined.
+        aim_mm: from the point that the lamp looks at to the estimated one; None for a distant lamp, or where the end of
+            its cone is not seen.
         is_diffuse: the light was called diffuse.
         poses: objects that were found.
         right_poses: of them, those within 15 mm and 10 deg, symmetries counted.
@@ -176,6 +178,7 @@ class LampScore:
     std_deg: float
     true_m: float | None
     distance_m: float | None
+    aim_mm: float | None
     is_diffuse: bool
     poses: int
     right_poses: int
@@ -198,6 +201,7 @@ def lamp_report(scores: Sequence[LampScore]) -> dict[str, Any]:
         "lamp_tasks": len(near),
         **spread("lamp_direction_deg", angles, _OF),
         **spread("lamp_distance_percent", known, _OF),
+        **spread("lamp_aim_mm", [s.aim_mm for s in near if s.aim_mm is not None], _OF),
         "lamp_undetermined": sum(s.distance_m is None for s in near),
         "lamp_diffuse": sum(s.is_diffuse for s in near),
         "lamp_within_5deg": mean(a <= _RIGHT_DEG for a in angles),
@@ -249,6 +253,9 @@ def _score(
     start = time.perf_counter()
     found = photo_lamp(scene.photos, last.found, surfels)
     seconds = time.perf_counter() - start
+    aim_mm = None
+    if scene.spot is not None and found.distance_known and found.shape.radius is not None:
+        aim_mm = 1e3 * float(np.linalg.norm(found.shape.aim_point - scene.spot.aim))
     right = 0
     for one in last.found:
         true, pose = scene.poses[one.name], one.best.pose
@@ -263,6 +270,7 @@ def _score(
         std_deg=float(np.rad2deg(found.std)),
         true_m=None if scene.spot is None else scene.spot.distance,
         distance_m=found.distance if found.distance_known else None,
+        aim_mm=aim_mm,
         is_diffuse=found.is_diffuse,
         poses=len(last.found),
         right_poses=right,

@@ -8,15 +8,16 @@ from osfcore.errors import InvalidInput
 from osfcore.experiments.lamps import EvaluateLamps, LampScore, evaluate_lamps, lamp_report, lamp_scene
 from osfcore.fields.field_library import FieldLibrary
 
-SCORE = LampScore(0, True, False, 2.0, 1.0, 1.0, 1.1, False, 3, 2, 0.5)
+SCORE = LampScore(0, True, False, 2.0, 1.0, 1.0, 1.1, 20.0, False, 3, 2, 0.5)
 
 
 def test_figures_of_known_and_unknown_lamps():
-    unknown = replace(SCORE, direction_deg=8.0, distance_m=None)
+    unknown = replace(SCORE, direction_deg=8.0, distance_m=None, aim_mm=None)
     distant = replace(unknown, is_near=False, true_m=None)
     report = lamp_report((SCORE, unknown, distant))
     assert report["lamp_direction_deg_median"] == 5.0
     assert report["lamp_distance_percent_median"] == pytest.approx(10)
+    assert report["lamp_aim_mm_median"] == 20
     assert report["lamp_undetermined"] == report["distant_undetermined"] == 1
     assert report["lamp_within_5deg"] == 0.5
     assert report["lamp_within_15percent"] == 1
