@@ -6,7 +6,8 @@ otherwise and estimates the same first frames: of objects in any resting orienta
 upright, where the search of the method as it ships begins. Lights are from the whole hemisphere, 5 deg up.
 
 Where an estimate is wrong although its losses are below those of the truth, no search could have helped: the loss
-itself prefers a wrong pose.
+itself prefers a wrong pose. The clearest cases are drawn: what an object's mask shows, how eq. 5 draws the object where
+it truly lies, under the light overhead, and how it draws it where the loss is lower.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from osfcore.errors import InvalidInput, UnknownName
@@ -34,9 +37,9 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, default_cameras
 from osfcore.geometry.poses import quaternion_exp, quaternion_multiply
 from osfcore.geometry.states import MAX_OBJECTS, SceneState
-from osfcore.inspection.contact_sheet import Comparison
+from osfcore.inspection.contact_sheet import Comparison, image_grid
 from osfcore.io.files import write_json
-from osfcore.io.image_file import to_uint8
+from osfcore.io.image_file import to_uint8, write_png
 from osfcore.metrics.pose_errors import pose_error
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.estimation import OVERHEAD, PaperEstimationConfig, estimate_first, masked_error, scene_error
@@ -47,11 +50,12 @@ from osfcore.world.tasks import MIN_ELEVATION_DEG, draw_scene, opened
 Starts = Literal["upright", "resting", "24"]
 Family = Literal["any", "upright"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
-REPORT_FILE = "report.json"
-VERSION = 1  # raised by hand when figures may change
+REPORT_FILE, PREFERRED_FILE = "report.json", "preferred.png"
+VERSION = 2  # raised by hand when figures may change
 RIGHT_MM, RIGHT_DEG = 10.0, 10.0
 _LIGHT_DEG = 10.0
 _YAWS = 4  # of each resting orientation
+_CASES = 6  # wrong poses that are drawn at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +121,7 @@ class EvaluatePaperEstimation:
 def evaluate_paper_estimation(
     config: EvaluatePaperEstimation, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None
 ) -> Iterator[EvaluationStep[dict[str, Any]]]:
-    """Estimate the same first frames under each setting; report.json goes to `config.out`.
+    """Estimate the same first frames under each setting; report.json and preferred.png go to `config.out`.
 
     Args:
         config: what to measure.
@@ -160,6 +164,13 @@ def evaluate_paper_estimation(
     for n, (family, setting) in enumerate(cells):
         row = summary([result.figures for result in results[n :: len(cells)]])
         report["families"].setdefault(family, {})[setting] = row
+    cases = preferred_cases(results)
+    report["preferred"] = [case for case, _ in cases]
+    if cases:
+        rows = {f"{case['deg']:.0f} deg": pictures for case, pictures in cases}
+        write_png(
+            config.out / PREFERRED_FILE, image_grid(rows, ("in its mask", "where it lies", "where eq. 5 is lower"))
+        )
     write_json(config.out / REPORT_FILE, report)
     yield EvaluationStep(len(pieces), len(pieces), "Everything is measured", report)
 
@@ -179,14 +190,60 @@ def _estimated(
     models = load_appearance(config.fields, draw.names, fields, config.data_dir)
     rng = stream_rng(config.seed, Stream.PAPER_SCENE, number, 1)
     figures = estimate(models, frame, SETTINGS[setting], resting, rng)
-    state = figures.pop("state")
+    state: SceneState = figures.pop("state")
     errors = [
         pose_error(assets.info(name).symmetry, state.pose(name), frame.truth.pose(name)) for name in frame.truth.names
     ]
     mm, deg = zip(*errors, strict=True)
     shown = models.together.render(SceneBatch.of(state), frame.observation.cameras[:1]).rgb[0, 0]
     comparison = Comparison(f"{family}: {setting}", *map(to_uint8, (frame.observation.images[0], shown)))
-    return TaskResult({**figures, "mm": rounded(list(mm), 3), "deg": rounded(list(deg), 3)}, (comparison,))
+    figures |= {"mm": rounded(list(mm), 3), "deg": rounded(list(deg), 3)}
+    wrong = [n for n in range(len(deg)) if deg[n] > RIGHT_DEG and figures["eq5"][n] < figures["eq5_true"][n]]
+    drawn = [_preferred(models, frame, state, n) for n in wrong]
+    about = {"names": list(frame.truth.names), "preferred": wrong}
+    return TaskResult({**figures, **about}, (comparison, *chain.from_iterable(drawn)))
+
+
+def _preferred(models: ObjectModels, frame: Frame, state: SceneState, n: int) -> tuple[Comparison, Comparison]:
+    """Return what the mask of an object shows beside eq. 5's drawing of it, where it lies and where it was found."""
+    name, observed = frame.truth.names[n], frame.observation
+    assert observed.masks is not None  # they were asked for
+    view = int(observed.masks[:, n].sum(axis=(1, 2)).argmax())  # that shows most of it
+    rows, columns = np.nonzero(observed.masks[view, n])
+    half = max(np.ptp(rows), np.ptp(columns)) // 2 + 6
+    top, left = (max(int(x.min() + x.max()) // 2 - half, 0) for x in (rows, columns))
+    part = np.s_[top : top + 2 * half, left : left + 2 * half]
+
+    def enlarged(image: np.ndarray) -> np.ndarray:
+        return cv2.resize(to_uint8(image[part]), observed.images.shape[1:3], interpolation=cv2.INTER_NEAREST)
+
+    seen = enlarged(observed.images[view] * observed.masks[view, n, ..., None])
+    drawn = []
+    for of in (frame.truth, state):
+        pose = of.pose(name)
+        batch = SceneBatch((name,), pose.position[None, None], pose.quaternion[None, None], np.array([OVERHEAD]), None)
+        drawn.append(enlarged(models.alone.render(batch, observed.cameras[view : view + 1]).rgb[0, 0]))
+    return Comparison(f"{name}, where it lies", seen, drawn[0]), Comparison(f"{name}, found", seen, drawn[1])
+
+
+def preferred_cases(results: Sequence[TaskResult]) -> list[tuple[dict[str, Any], list[UInt8[np.ndarray, "h w 3"]]]]:
+    """Return the wrong poses that eq. 5 prefers most clearly, one of each object, with three pictures.
+
+    Args:
+        results: of all estimates.
+    """
+    cases = []
+    for result in results:
+        figures, shown = result.figures, result.shown[1:]
+        for k, n in enumerate(figures["preferred"]):
+            case = {"name": figures["names"][n], **{key: figures[key][n] for key in ("deg", "mm", "eq5", "eq5_true")}}
+            cases.append((case, [shown[2 * k].truth, shown[2 * k].ours, shown[2 * k + 1].ours]))
+    best = {case["name"]: (case, pictures) for case, pictures in sorted(cases, key=lambda one: -_ratio(one[0]))}
+    return sorted(best.values(), key=lambda one: _ratio(one[0]))[:_CASES]
+
+
+def _ratio(case: Mapping[str, Any]) -> float:
+    return case["eq5"] / case["eq5_true"]
 
 
 def estimate(

@@ -6,8 +6,10 @@ import pytest
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.experiments import paper_estimation as published
+from osfcore.experiments.harness import TaskResult
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import rotation_angle
+from osfcore.inspection.contact_sheet import Comparison
 from osfcore.paper.estimation import PaperEstimationConfig
 from tests.support.errors import about
 from tests.support.solids import SOLIDS
@@ -43,6 +45,10 @@ def test_each_setting_estimates_the_same_scenes_of_both_families(asked, library,
         assert rows["little"]["objects"] == 4
         assert 0 <= rows["little"]["share"] <= 1
     assert report_of(asked, library) == report  # what was measured is taken over
+    for case in report["preferred"]:
+        assert case["deg"] > 10
+        assert case["eq5"] < case["eq5_true"]
+    assert (asked.out / published.PREFERRED_FILE).exists() == bool(report["preferred"])
 
 
 def test_what_cannot_be_measured_is_refused(asked, library, tmp_path, little):
@@ -80,3 +86,19 @@ def test_a_loss_that_prefers_a_wrong_pose_is_counted():
     assert (row["objects"], row["turned_wrongly"]) == (3, 2)
     assert row["share"] == pytest.approx(1 / 3, abs=1e-4)
     assert (row["eq5_prefers_wrong"], row["eq6_prefers_wrong"]) == (0.5, 0)
+
+
+def test_the_clearest_case_of_each_object_comes_first():
+    """Of three estimates: of two objects, one of which was found wrongly twice."""
+
+    def result(number, names, eq5, preferred):
+        picture = np.full((8, 8, 3), number, np.uint8)
+        figures = {"names": names, "deg": [90.0] * 2, "mm": [1.0] * 2, "eq5": eq5, "eq5_true": [1.0] * 2}
+        shown = [Comparison("", picture, picture)] * (1 + 2 * len(preferred))
+        return TaskResult({**figures, "preferred": preferred}, tuple(shown))
+
+    results = [result(0, ["a", "b"], [0.9, 2.0], [0]), result(1, ["b", "a"], [0.4, 0.5], [0, 1])]
+    results.append(result(2, ["a"], [3.0], []))
+    cases = published.preferred_cases(results)
+    assert [(case["name"], case["eq5"]) for case, _ in cases] == [("b", 0.4), ("a", 0.5)]
+    assert all(len(pictures) == 3 and pictures[0][0, 0, 0] == 1 for _, pictures in cases)
