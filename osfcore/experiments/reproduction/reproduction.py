@@ -16,11 +16,11 @@ from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput, check_seed
 from osfcore.experiments import relighting, unrolled_estimation, video_prediction
 from osfcore.experiments.charts import Axis, Bar, Chart, Curve, write_bars, write_charts
-from osfcore.experiments.dynamics import DynamicsMethod, EvaluateDynamics, evaluate_dynamics
+from osfcore.experiments.dynamics import COUNTS, DynamicsMethod, EvaluateDynamics, evaluate_dynamics
 from osfcore.experiments.factors import EPISODE_FACTORS
 from osfcore.experiments.harness import EvaluationStep, finished
 from osfcore.experiments.images import FIELD_METHODS, TITLES, common_names
-from osfcore.experiments.photos import EvaluatePhotos, evaluate_photos, starts_of
+from osfcore.experiments.photos import EvaluatePhotos, described, evaluate_photos, starts_of
 from osfcore.experiments.rearrangement import (
     EvaluateMpc,
     MpcReport,
@@ -187,8 +187,8 @@ def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
             "also the one as published, whose own evaluation has them at every step (below, under ablations). "
             "Compositional NeRFs and the two lights take the place of our fields and our estimate of the light in our "
             "loop. Ours refuses goals that it doubts, and fails there; others refuse none: what our doubts would have "
-            "refused is counted beside them. Visual foresight has a FitVid of 7.4 million parameters, which learned "
-            "for 45 minutes on one core; this says little of the original's 302 million."
+            "refused is counted beside them. Visual foresight has a FitVid of 4.0 million parameters, told where the "
+            "pusher is, which learned for 65 minutes on one core; this says little of the original's 302 million."
         )
         sections.append(Section("methods", title, text, tuple(cells)))
     return sections
@@ -702,6 +702,8 @@ def reproduce(config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, exe
     for part in config.parts:
         if part not in PARTS:
             raise InvalidInput("part of the report", part, ", ".join(PARTS))
+    if config.photos is not None and not described(config.photos):
+        raise InvalidInput("folder of photographs", config.photos, "one with photo.json, or with folders that have one")
     names = common_names(FIELD_METHODS, config.names, fields, assets, config.data_dir, config.scale.objects)
     config = replace(config, about=replace(config.about, names=names))
     images = dict[EvaluationName, Any]()
@@ -729,7 +731,7 @@ def _evaluations(
     unrolled = UnrollEstimates(folder, data_dir, tasks=scale.frames, methods=unrolled_estimation.METHODS, **given)
     relit = CompareRelighting(folder, data_dir, tasks=scale.scenes, **given)
     videos = CompareVideos(folder, data_dir, tasks=scale.videos, **given)
-    names = config.about.names
+    names = config.about.names if len(config.about.names) > min(COUNTS) else None  # too few for pushes: all there are
     methods: tuple[DynamicsMethod, ...] = ("ours", "paper")
     pushes = {m: EvaluateDynamics(folder / "dynamics", scale.pushes, seed, names, data_dir, m) for m in methods}
     found = dict[EvaluationName, Generator[EvaluationStep[Any], None, Any]]()
@@ -739,10 +741,8 @@ def _evaluations(
     found["dynamics"] = _all_reported("Predicted poses", predicted)
     found["video"] = _reported("Predicted futures", compare_videos(videos, fields, assets, executor))
     if config.photos is not None:
-        starts = {
-            start: EvaluatePhotos(folder / "photos" / start, config.photos, start) for start in starts_of(config.photos)
-        }
-        looked = {start: evaluate_photos(one, fields) for start, one in starts.items()}
+        starts, place = starts_of(config.photos), folder / "photos"
+        looked = {s: evaluate_photos(EvaluatePhotos(place / s, config.photos, s), fields) for s in starts}
         found["photos"] = _all_reported("Photographs", looked)
     return found
 
@@ -759,6 +759,7 @@ def _reported(title: str, steps: Iterator[EvaluationStep[Any]]) -> Generator[Eva
 def _all_reported(
     title: str, evaluations: Mapping[str, Iterator[EvaluationStep[Any]]]
 ) -> Generator[EvaluationStep[Any], None, Any]:
+    """Pass on the steps of several evaluations, one after the other; return their reports by name."""
     reports = {}
     for name, steps in evaluations.items():
         reports[name] = yield from _reported(f"{title}, {name}", steps)

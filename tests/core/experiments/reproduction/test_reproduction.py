@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from osfcore.control.events import EpisodeSettings
+from osfcore.errors import InvalidInput
 from osfcore.experiments.factors import EPISODE_FACTORS
 from osfcore.experiments.rearrangement import EvaluateMpc
 from osfcore.experiments.rearrangement_runs import Variant, check_variant
@@ -24,6 +25,7 @@ from osfcore.experiments.reproduction.reproduction import (
 from osfcore.experiments.rivals.fitvid import FitVidModel, FitVidSettings, write_fitvid
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.planning.mppi import PlanSettings
+from tests.support.errors import about as error_about
 from tests.support.photographs import NAME as BOX
 from tests.support.photographs import take, write_photo
 
@@ -130,6 +132,8 @@ def test_photographs_are_reported_where_there_are_any(library, tmp_path):
     assert [score["scene"] for score in report["photos"]["none"]["scores"]] == ["desk"]
     assert "<td>desk</td>" in (asked.folder / PAGE_FILE).read_text()
     assert "photos" not in reproduced(library, replace(asked, photos=None))[-1].report
+    with pytest.raises(InvalidInput, check=error_about("photographs")):  # before any work
+        next(reproduce(replace(asked, photos=tmp_path / "out"), FieldLibrary(None), library))
 
 
 # Sections
