@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import shutil
 import threading
 import time
@@ -30,6 +31,7 @@ from osfcore.geometry.light import Light
 from osfcore.objects.asset_library import AssetLibrary, check_name
 
 _PROBE_S = 5.0  # between two tries whether the disk takes something
+_STALE_S = 60.0  # after which the last try says nothing any more
 RESERVED = ("table", "sets")  # the table's own field, and a path of the REST interface
 _log = logging.getLogger(__name__)
 
@@ -109,7 +111,8 @@ class Runner:
         self._ordering = threading.Lock()  # what was checked for a job still holds when it is queued
         self._demo_due = settings.demo_scene
         self._started = time.monotonic()
-        self._probed_at, self._refusal = -_PROBE_S, None
+        self._probed_at, self._refusal = -math.inf, None
+        self._probing: threading.Thread | None = None
 
     def start(self) -> None:
         """Take over what the store holds, start simulation and jobs, make a first scene if there is none."""
@@ -128,6 +131,8 @@ class Runner:
     def stop(self) -> None:
         """End all processes. Calling it again does nothing."""
         self.sets.stop()
+        if self._probing is not None:
+            self._probing.join()
         self.jobs.stop()
         if self._standby is not None:
             self._standby.stop()
@@ -146,13 +151,22 @@ class Runner:
 
     def storing_problem(self) -> str | None:
         """Why something is not stored, for people; None if all is. Tries to write now and then."""
-        if time.monotonic() - self._probed_at > _PROBE_S:
-            self._probed_at, self._refusal = time.monotonic(), self._store.probe()
+        age_s = time.monotonic() - self._probed_at
+        if age_s > _PROBE_S:
+            self._probed_at = time.monotonic()
+            # A disk may take long, and whoever asks often need not wait for it.
+            self._probing = threading.Thread(target=self._probe, name="probe of the disk", daemon=True)
+            self._probing.start()
+            if age_s > _STALE_S:
+                self._probing.join()
         if self.unwritten:
             changed = "one scene or job" if self.unwritten == 1 else f"{self.unwritten} scenes and jobs"
             waits = f"What has become of {changed} could not be stored; it is tried again."
             return waits if self._refusal is None else f"{waits} {self._refusal}"
         return self._refusal
+
+    def _probe(self) -> None:
+        self._refusal = self._store.probe()
 
     @property
     def uptime_s(self) -> float:
