@@ -79,6 +79,7 @@ class Scale:
         foresight: how visual foresight plans.
         factors: of variation.
         families: beside `shifted`, with three objects.
+        has_upright: whether methods are also compared on objects that stand upright, as the paper's seem to.
         scenes: that fields are compared on.
         videos: that predictions are compared on.
         frames: whose estimates are shown step by step.
@@ -95,6 +96,7 @@ class Scale:
     foresight: ForesightSettings = field(default_factory=ForesightSettings)
     factors: tuple[str, ...] = EPISODE_FACTORS
     families: tuple[Family, ...] = ("turned", "crowded", "relit")
+    has_upright: bool = True
     scenes: int = 20
     videos: int = 20
     frames: int = 20
@@ -105,7 +107,7 @@ class Scale:
 _FEW = EpisodeSettings(steps=12, plan=PlanSettings(samples=32, horizon=10))
 QUICK = Scale(
     tasks=3, headline=3, counts=(1,), objects=1, settings=_FEW, published=GaussianPlanSettings(48, 8),
-    foresight=ForesightSettings(8, 6), factors=("light_low",), families=(), scenes=3,
+    foresight=ForesightSettings(8, 6), factors=("light_low",), families=(), has_upright=False, scenes=3,
     videos=3, frames=1, pushes=1, has_slow_cells=False,
 )  # fmt: skip
 
@@ -136,6 +138,11 @@ class Section(NamedTuple):
 def objects_in_words(count: int) -> str:
     """Return words such as "1 object"."""
     return f"{count} object{'s' * (count > 1)}"
+
+
+def _objects(figures: Mapping[str, Any]) -> str:
+    """Return how many objects a cell's tasks have, and how they stand, in words."""
+    return objects_in_words(figures["objects"]) + " that stand upright" * (figures["family"] == "upright")
 
 
 def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...] = SECTIONS) -> tuple[Section, ...]:
@@ -173,15 +180,17 @@ def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...]
 
 def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
     sections = []
-    for count in scale.counts:
-        tasks = scale.headline if count == scale.objects else scale.tasks
-        given = replace(base, objects=count, tasks=tasks, oracle=count == scale.objects)
+    worlds: list[tuple[int, Family]] = [(count, "shifted") for count in scale.counts]
+    for count, family in [*worlds, *([(scale.objects, "upright")] if scale.has_upright else [])]:
+        is_headline = count == scale.objects and family == "shifted"
+        tasks = scale.headline if is_headline else scale.tasks
+        given = replace(base, objects=count, family=family, tasks=tasks, oracle=is_headline)
         cells = [
             Cell(label, replace(given, variant=variant, oracle=given.oracle and label == "ours"))
             for label, variant in _METHODS.items()
             if scale.has_slow_cells or variant.method != "overhead"
         ]
-        title = f"Success by threshold, {objects_in_words(count)} (Fig. 7)"
+        title = f"Success by threshold, {_objects({'objects': count, 'family': family})} (Fig. 7)"
         text = (
             "Closed loops toward a goal image. All methods get the same tasks, and masks in the first frame alone, "
             "also the one as published, whose own evaluation has them at every step (below, under ablations). "
@@ -380,7 +389,7 @@ def _success_chart(section: MeasuredSection) -> Chart:
     if first.report.oracle:
         kinds["told the truth"] = first.report.told_truth
     curves = [_curve(name, scores) for name, scores in kinds.items()]
-    return Chart(_objects(first), _DISTANCE, _SHARE, curves)
+    return Chart(_objects(first.figures), _DISTANCE, _SHARE, curves)
 
 
 def _curve(name: str, scores: Sequence[RearrangementScore]) -> Curve:
@@ -413,7 +422,7 @@ def findings(sections: Sequence[MeasuredSection]) -> list[str]:
         ours = section.cells[0]
         mean, nothing = (ours.figures[f"{who}pose6d_symmetric_mean"] for who in ("", "noaction_"))
         sentences.append(
-            f"{_objects(ours)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
+            f"{_objects(ours.figures)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
             f"{nothing:.3f}: {'at most' if mean <= _HALF * nothing else 'more than'} half."
         )
     for cell in (cell for section in sections if section.section.name == "factors" for cell in section.cells[1:]):
@@ -444,14 +453,10 @@ def _method(ours: MeasuredCell, other: MeasuredCell, key: str, corrected: float)
     better = "ours is better" if lead > 0 else "ours is worse"
     verdict = better if corrected < _SIGNIFICANT else "no difference is shown"
     return (
-        f"{_objects(ours)}, ours and {other.label}, {_COMPARED[key]}: {100 * ours.figures[key]:.0f} % against "
+        f"{_objects(ours.figures)}, ours and {other.label}, {_COMPARED[key]}: {100 * ours.figures[key]:.0f} % against "
         f"{100 * other.figures[key]:.0f} %, which is {lead:+.0f} points (95 %: {low:+.0f} to {high:+.0f}; "
         f"McNemar p = {_gap(other, key)['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
     )
-
-
-def _objects(cell: MeasuredCell) -> str:
-    return objects_in_words(cell.figures["objects"])
 
 
 _HEADS = (

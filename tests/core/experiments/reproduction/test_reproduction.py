@@ -159,7 +159,10 @@ def test_cells_of_a_section_differ_but_have_the_same_tasks(scale):
 
 def test_a_full_report_has_what_was_asked_for():
     methods = named("methods")
-    assert [(s.cells[0].config.objects, s.cells[0].config.tasks) for s in methods] == [(2, 50), (3, 100), (4, 50)]
+    firsts = [section.cells[0].config for section in methods]
+    assert [(c.objects, c.family, c.tasks) for c in firsts] == [
+        (2, "shifted", 50), (3, "shifted", 100), (4, "shifted", 50), (3, "upright", 50),
+    ]  # fmt: skip
     assert all(cell.config.actions == cell.config.settings.steps == 30 for s in methods for cell in s.cells)
     assert [cell.config.oracle for cell in methods[1].cells] == [True, False, False, False, False, False]
     (factors,) = named("factors")
