@@ -207,14 +207,16 @@ class TrainFitVidCommand(DataCommand):
     """Windows in each step of descent."""
     frames: int = 12
     """Frames of a window, of which two are given."""
-    rate: float = 1e-3
+    rate: float = 2e-3
     """Of learning."""
     warm_up: int = 200
     """Steps over which the rate rises from nothing."""
     beta: float = 1e-4
     """Weight of the KL divergence."""
+    decoded: int = 4
+    """Frames of each window that are drawn in a step."""
     augment: bool = True
-    """Vary crops and colours."""
+    """Vary colours."""
     precision: Literal["bfloat16", "float32"] = "bfloat16"
     """What convolutions compute in while training."""
     save_every: int = 20

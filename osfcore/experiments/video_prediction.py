@@ -191,7 +191,8 @@ def measure_video(
             predicted = np.broadcast_to(video.context[1], video.frames.shape)
         case "fitvid":
             network = read_fitvid(fitvid_path(config.data_dir))
-            predicted = network.predict(video.context, video.actions[None], between=video.between)[0]
+            assert video.look.pusher is not None  # for the type checker: a robot knows its hand
+            predicted = network.predict(video.context, video.actions[None], video.look.pusher, between=video.between)[0]
         case "ours" | "paper" | "nerf":
             models = load_scene_models(video.look.names, fields, assets, config.data_dir)
             parts = loop_parts(Variant(method), models, fields, config.data_dir)

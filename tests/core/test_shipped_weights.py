@@ -11,6 +11,8 @@ import pytest
 from osfcore.dynamics.graph import read_network, shipped
 from osfcore.dynamics.rollout import PushModel, load_shapes
 from osfcore.experiments.images import FIELD_METHODS, known_names, load_appearance
+from osfcore.experiments.rivals.fitvid import fitvid_path, read_fitvid
+from osfcore.experiments.rivals.train_fitvid import action_effect
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
@@ -25,7 +27,8 @@ from osfcore.world.tabletop import Tabletop
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 FIELDS = FieldLibrary(None)
-SHIPPED = [(method, name) for method in FIELD_METHODS for name in sorted(known_names(method, FIELDS, None))]
+METHODS = [method for method in FIELD_METHODS if method != "nerf_fitted"]  # whose fields are those of "nerf"
+SHIPPED = [(method, name) for method in METHODS for name in sorted(known_names(method, FIELDS, None))]
 ABOVE = Camera.look_at("above", (0, 0, 0.6), (0, 0, 0), size=64, up=(0.0, 1.0, 0.0))
 
 
@@ -84,3 +87,10 @@ def test_a_network_predicts_pushes_better_than_no_motion(library, network, share
         ways.append(np.linalg.norm(start.poses.position[0] - end.poses.position[0]))
     assert np.mean(ways) > 0.03
     assert np.mean(errors) < share * np.mean(ways)
+
+
+@pytest.mark.slow
+def test_predicted_images_depend_on_actions(library):
+    effect = action_effect(read_fitvid(fitvid_path(None)), library, library.names(), seed=1)
+    assert effect["true"] > 0.01
+    assert effect["predicted"] > effect["true"] / 3

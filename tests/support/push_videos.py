@@ -25,9 +25,8 @@ def episode(side: int, steps: int, seed: int, *, with_frames: bool = True, names
     still = np.zeros((steps + 1, len(names), 3))
     turned = np.tile([1.0, 0, 0, 0], (steps + 1, len(names), 1))
     contact = np.zeros((steps, len(names)), bool)
-    return PushEpisode(
-        names, seed, still, turned, still[:, 0], actions, contact, frames=frames if with_frames else None
-    )
+    pusher = np.concatenate([np.zeros((1, 3)), np.cumsum(STEP_S * actions, axis=0)])
+    return PushEpisode(names, seed, still, turned, pusher, actions, contact, frames=frames if with_frames else None)
 
 
 def write_videos(path, side: int = 16, steps: int = 6, count: int = 14, **more):

@@ -197,7 +197,7 @@ def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
             "Compositional NeRFs and the two lights take the place of our fields and our estimate of the light in our "
             "loop. Ours refuses goals that it doubts, and fails there; others refuse none: what our doubts would have "
             "refused is counted beside them. Visual foresight has a FitVid of 4.0 million parameters, told where the "
-            "pusher is, which learned for 65 minutes on one core; this says little of the original's 302 million."
+            "pusher is, which learned for 50 minutes on one core; this says little of the original's 302 million."
         )
         sections.append(Section("methods", title, text, tuple(cells)))
     return sections

@@ -3,23 +3,30 @@
 A frame x_t becomes a vector h_t and feature maps in the encoder. From there on everything is recurrent over vectors:
 
     posterior   q(z_t | x_1..t)     from h_t
-    prior       p(z_t | x_1..t-1)   from h_t-1
-    next frame  h'_t = sigmoid(LSTM(h_t-1, a_t-1, z_t)),    x'_t = decoder(h'_t, c, feature maps of c)
+    prior       p(z_t | x_c)        from h_c
+    next frame  d_t = LSTM(h_c, a_t-1, f(p_t), z_t),    x'_t = decoder(d_t, f(p_t) - f(p_c), c)
 
-with the last context frame c, and what is minimised is sum_t |x_t - x'_t|^2 (a mean over pixels) + beta * KL(q || p),
-with z_t from the posterior and true frames behind h_t-1. To predict, z_t comes from the prior, and behind the context
-h_t-1 from the predicted frame.
+with the last context frame c and its feature maps, and the places of the pusher p_t as sines and cosines f. What is
+minimised is sum_t |x_t - x'_t|^2 (a mean over pixels) + beta * KL(q || p), with z_t from the posterior; to predict, z_t
+comes from the prior.
 
-Deviations from the published program: channels start with 4 at full size, where the original has 64, and double per
-stage; there are as many stages as leave 8 x 8 pixels to the coarsest maps, whatever the images' size. A frame's
-vector is a linear function of its whole coarsest map, not of the map's mean: of so few channels the mean does not
-tell where anything is. The network that ships has the mean, and ignores actions (docs/evaluation.md). The frame
-predictor's last layer begins 30 times larger, for else its sigmoid begins close to a half everywhere and says nothing
-to the decoder. Batch norm takes its statistics over all steps of a batch at once, not step by step. The frame
-predictor has no variance, which the original computes and never uses. The decoder changes the last context frame,
-where the original's draws a new one. Encoder and decoder may compute in bfloat16. Predictions take the skip
-connections from the last context frame, as training does; the original takes those of the first one there. Actions
-are in units of the highest speed.
+The deviations from the published program are what lets so small a network, trained for so short a time, follow actions
+at all:
+
+- Channels start with 4 at full size, where the original has 64, and double per stage; there are as many stages as
+  leave 8 x 8 pixels to the coarsest maps, whatever the images' size.
+- It is told where the pusher is, as all other methods here are; the original sees it in images alone.
+- Behind the context the recurrence sees neither true nor predicted frames, where the original's sees the one before. So
+  what it is trained for is what it does when it predicts.
+- The recurrence tells the decoder what has changed since the last context frame, in batch norm, where the original's
+  tells all of the next frame's vector; the decoder changes that frame, where the original's draws a new one. A pusher
+  is a few pixels of a scene: in a vector of everything it is lost beside what stands still.
+- A frame's vector is a linear function of its whole coarsest map, not of the map's mean, and is brought to unit
+  variance.
+- Batch norm takes its statistics over all steps of a batch at once, not step by step. The frame predictor has no
+  variance, which the original computes and never uses. Encoder and decoder may compute in bfloat16. The skip
+  connections come from the last context frame, in the original from the first one. Actions are in units of the highest
+  speed.
 """
 
 from __future__ import annotations
@@ -36,9 +43,10 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
+from osfcore.dynamics.rollout import pusher_centres
 from osfcore.errors import CorruptFile, InvalidInput, check_ranges, shown
 from osfcore.experiments.rivals import repository_weights
-from osfcore.geometry.workspace import MAX_SPEED_M_S
+from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_CENTRE_Z_M, PUSHER_REACH_M, STEP_S
 from osfcore.io.checkpoint import read_parameters
 from osfcore.io.files import write_atomically
 
@@ -137,9 +145,6 @@ class DecoderCell(nn.Module):
 # FitVid's recurrent parts: Gaussians over the latent, step by step, and the vector of the next frame.
 
 
-State = tuple[Float[Tensor, "layers B hidden"], Float[Tensor, "layers B hidden"]]
-
-
 class Gaussian(NamedTuple):
     """A normal distribution with a diagonal covariance.
 
@@ -188,11 +193,9 @@ class Recurrence(nn.Module):
         super().__init__()
         self.embedding, self.lstm = nn.Linear(inputs, hidden), nn.LSTM(hidden, hidden, layers, batch_first=True)
 
-    def forward(
-        self, x: Float[Tensor, "B T inputs"], state: State | None = None
-    ) -> tuple[Float[Tensor, "B T hidden"], State]:
-        """Return outputs of the last layer, and the state after the last step; without a state it begins with zeros."""
-        return self.lstm(self.embedding(x), state)
+    def forward(self, x: Float[Tensor, "B T inputs"]) -> Float[Tensor, "B T hidden"]:
+        """Return outputs of the last layer; the state begins with zeros."""
+        return self.lstm(self.embedding(x))[0]
 
 
 class LatentLSTM(nn.Module):
@@ -209,17 +212,17 @@ class LatentLSTM(nn.Module):
         self.recurrence = Recurrence(inputs, hidden, 1)
         self.mean, self.logvar = nn.Linear(hidden, latent), nn.Linear(hidden, latent)
 
-    def forward(self, x: Float[Tensor, "B T inputs"], state: State | None = None) -> tuple[Gaussian, State]:
-        """Return Gaussians (B, T, z), and the state to go on from."""
-        y, after = self.recurrence(x, state)
-        return Gaussian(self.mean(y), self.logvar(y)), after
+    def forward(self, x: Float[Tensor, "B T inputs"]) -> Gaussian:
+        """Return Gaussians (B, T, z)."""
+        y = self.recurrence(x)
+        return Gaussian(self.mean(y), self.logvar(y))
 
 
 class FrameLSTM(nn.Module):
-    """The vector of the next frame from that of this one, the action and the latent.
+    """What changes until the next frame; nothing at the beginning of training.
 
     Args:
-        inputs: length of all three together.
+        inputs: length of all that is given.
         hidden: units of each of both layers.
         features: length of the vector (g).
     """
@@ -228,12 +231,9 @@ class FrameLSTM(nn.Module):
         super().__init__()
         self.recurrence, self.head = Recurrence(inputs, hidden, 2), nn.Linear(hidden, features)
 
-    def forward(
-        self, x: Float[Tensor, "B T inputs"], state: State | None = None
-    ) -> tuple[Float[Tensor, "B T g"], State]:
-        """Return vectors in (0, 1), and the state to go on from."""
-        y, after = self.recurrence(x, state)
-        return self.head(y).sigmoid(), after
+    def forward(self, x: Float[Tensor, "B T inputs"]) -> Float[Tensor, "B T g"]:
+        """Return changes."""
+        return self.head(self.recurrence(x))
 
 
 # FitVid's encoder of a frame, and the decoder that mirrors it and takes its features over skip connections.
@@ -247,22 +247,32 @@ COARSEST_SIDE = 8  # of the feature maps between encoder and decoder, as in the 
 _CELLS = 2  # of a stage
 _LEAST = 1 / 256  # of a colour whose logit is taken
 
+_WAVES = (1, 2, 4, 8)  # half periods of the sines and cosines over the pusher's reach
+PLACE_FEATURES = 2 + 4 * len(_WAVES)
+
+
+def place_features(pushers: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch f"]:
+    """Return places of the pusher [m] as numbers, sines and cosines (Tancik et al., 2020)."""
+    x = pushers / PUSHER_REACH_M
+    return torch.cat([x, *(wave(torch.pi * n * x) for n in _WAVES for wave in (torch.sin, torch.cos))], dim=-1)
+
+
 Skips = Sequence[Float[Tensor, "_ _ _ _"]]  # features after each of the encoder's cells, the finest first
 
 
 class Encoder(nn.Module):
     """A frame as a vector: stages of two cells, all but the first beginning by halving the image, then a linear layer.
 
+    The vector is brought to mean 0 and variance 1 (Ba et al., 2016).
+
     Args:
         stages: their number; channels double from one to the next.
         width: channels of the first stage.
         features: length of the vector (g).
-        is_pooled: whether the linear layer sees the coarsest map's mean, as in the original, or all of it.
     """
 
-    def __init__(self, stages: int, width: int, features: int, *, is_pooled: bool = False) -> None:
+    def __init__(self, stages: int, width: int, features: int) -> None:
         super().__init__()
-        self._is_pooled = is_pooled
         cells, before = [], 3
         for stage in range(stages):
             for cell in range(_CELLS):
@@ -270,7 +280,7 @@ class Encoder(nn.Module):
                 cells.append(EncoderCell(before, after, 2 if stage > 0 and cell == 0 else 1))
                 before = after
         self.cells = nn.ModuleList(cells)
-        self.head = nn.Linear(before if is_pooled else before * COARSEST_SIDE**2, features)
+        self.head, self.norm = nn.Linear(before * COARSEST_SIDE**2, features), nn.LayerNorm(features)
 
     def forward(self, frames: Float[Tensor, "B 3 h w"]) -> tuple[Float[Tensor, "B g"], list[Float[Tensor, "B _ _ _"]]]:
         """Return the vector of each frame, and the features after each cell."""
@@ -279,11 +289,11 @@ class Encoder(nn.Module):
         for cell in self.cells:
             x = cell(x)
             skips.append(x)
-        return self.head(x.mean(dim=(2, 3)) if self._is_pooled else x.flatten(1)), skips
+        return self.norm(self.head(x.flatten(1))), skips
 
 
 class Decoder(nn.Module):
-    """A vector as a frame: a linear layer to the coarsest map, the encoder's stages backwards, a 3 x 3 convolution.
+    """A change as a frame: a linear layer to the coarsest map, the encoder's stages backwards, a 3 x 3 convolution.
 
     After each cell the features of the encoder's cell across from it are added.
 
@@ -296,7 +306,8 @@ class Decoder(nn.Module):
     def __init__(self, stages: int, width: int, features: int) -> None:
         super().__init__()
         self._channels = before = width * 2 ** (stages - 1)
-        self.ground = nn.Linear(features, before * COARSEST_SIDE**2)
+        self.ground = nn.Linear(features + PLACE_FEATURES, before * COARSEST_SIDE**2)
+        self.norm = nn.BatchNorm1d(before * COARSEST_SIDE**2)
         cells = []
         for stage in reversed(range(stages)):
             for cell in range(_CELLS):
@@ -307,23 +318,22 @@ class Decoder(nn.Module):
         self.colours = nn.Conv2d(before, 3, 3, padding=1, bias=False)
 
     def forward(
-        self, vectors: Float[Tensor, "B g"], skips: Skips, known: Float[Tensor, "_ 3 h w"]
+        self, changes: Float[Tensor, "B changed"], skips: Skips, known: Float[Tensor, "_ 3 h w"]
     ) -> Float[Tensor, "B 3 h w"]:
         """Return frames in [0, 1].
 
         Args:
-            vectors: of frames.
-            skips: of the encoder, for each of the vectors or of one frame for all of them.
+            changes: of vector and place of the pusher since the known frame.
+            skips: of the encoder, for each of the changes or of one frame for all of them.
             known: the frames of which those are.
         """
-        x = self.ground(vectors).view(len(vectors), self._channels, COARSEST_SIDE, COARSEST_SIDE)
+        x = self.norm(self.ground(changes)).view(len(changes), self._channels, COARSEST_SIDE, COARSEST_SIDE)
         for cell, skip in zip(self.cells, reversed(skips), strict=True):
             x = cell(x) + skip
         return (torch.logit(known, _LEAST) + self.colours(x).float()).sigmoid()
 
 
 CONTEXT = 2  # frames that are given
-_FIRST_GAIN = 30.0  # of the layer from which vectors of next frames come
 _ACTION = 3
 _MOST_STAGES = 8
 _AT_ONCE = 32  # sequences: more would take memory and no less time
@@ -339,7 +349,6 @@ class FitVidSettings:
         features: length of a frame's vector (g).
         hidden: units of the LSTMs.
         latent: components of z.
-        is_pooled: whether a frame's vector comes from the mean of its coarsest map, as in the original.
     """
 
     side: int = 128
@@ -347,7 +356,6 @@ class FitVidSettings:
     features: int = 128
     hidden: int = 256
     latent: int = 10
-    is_pooled: bool = False
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -394,19 +402,18 @@ class FitVidModel(nn.Module):
         super().__init__()
         self.settings = s = settings or FitVidSettings()
         self.precision = precision
-        self.encoder = Encoder(s.stages, s.width, s.features, is_pooled=s.is_pooled)
+        self.encoder = Encoder(s.stages, s.width, s.features)
         self.decoder = Decoder(s.stages, s.width, s.features)
         self.posterior = LatentLSTM(s.features, s.hidden, s.latent)
         self.prior = LatentLSTM(s.features, s.hidden, s.latent)
-        self.frame_predictor = FrameLSTM(s.features + _ACTION + s.latent, s.hidden, s.features)
+        self.frame_predictor = FrameLSTM(s.features + _ACTION + PLACE_FEATURES + s.latent, s.hidden, s.features)
         for module in self.modules():
             if isinstance(module, nn.Conv2d | nn.Linear):  # as the original begins (LeCun)
                 nn.init.normal_(module.weight, std=module.weight[0].numel() ** -0.5)
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
         nn.init.zeros_(self.decoder.colours.weight)
-        with torch.no_grad():
-            self.frame_predictor.head.weight *= _FIRST_GAIN
+        nn.init.zeros_(self.frame_predictor.head.weight)
 
     @property
     def parameter_count(self) -> int:
@@ -418,46 +425,62 @@ class FitVidModel(nn.Module):
             vectors, skips = self.encoder(frames)
         return vectors.float(), skips
 
-    def _decoded(self, vectors: Float[Tensor, "B g"], skips: Skips, known: Tensor) -> Float[Tensor, "B 3 h w"]:
-        with torch.autocast(vectors.device.type, self.precision, enabled=self.precision != torch.float32):
-            return self.decoder(vectors, skips, known)
+    def _decoded(self, changes: Float[Tensor, "B changed"], skips: Skips, known: Tensor) -> Float[Tensor, "B 3 h w"]:
+        with torch.autocast(changes.device.type, self.precision, enabled=self.precision != torch.float32):
+            return self.decoder(changes, skips, known)
+
+    def _changes(self, vectors: Tensor, actions: Tensor, places: Tensor, latents: Tensor) -> Float[Tensor, "B T g"]:
+        """Return what changes; places are those after the actions."""
+        return self.frame_predictor(torch.cat([vectors, actions / MAX_SPEED_M_S, places, latents], dim=-1))
 
     def losses(
         self,
         frames: Float[Tensor, "B T1 3 side side"],
         actions: Float[Tensor, "B T 3"],
+        pushers: Float[Tensor, "B T1 2"],
         generator: torch.Generator | None,
+        decoded: Sequence[int] | None = None,
     ) -> Losses:
-        """Return the losses of predicting each frame but the first from the true ones before it.
+        """Return the losses of predicting each frame but the first from the context, of which there is one at first.
 
         Args:
             frames: in [0, 1], three at least.
             actions: between them [m/s].
+            pushers: places of the pusher in them [m].
             generator: draws the latents.
+            decoded: those of the T steps whose images count, in place of all; each then counts T / len(decoded) times.
         """
         count, length = frames.shape[:2]
+        steps = list(range(length - 1) if decoded is None else decoded)
+        known = [min(step, CONTEXT - 1) for step in range(length - 1)]  # last frame of the context, at each step
         vectors, skips = self._encoded(frames.flatten(0, 1))
-        vectors = vectors.unflatten(0, (count, length))
-        posterior, _ = self.posterior(vectors[:, 1:])
-        prior, _ = self.prior(vectors[:, :-1])
-        inputs = [vectors[:, :-1], actions / MAX_SPEED_M_S, posterior.sample(generator)]
-        following, _ = self.frame_predictor(torch.cat(inputs, dim=-1))
-        seen = [min(step, CONTEXT - 1) for step in range(length - 1)]  # frames whose maps are handed over
-        skips = [skip.unflatten(0, (count, length))[:, seen].flatten(0, 1) for skip in skips]
-        predicted = self._decoded(following.flatten(0, 1), skips, frames[:, seen].flatten(0, 1))
-        predicted = predicted.unflatten(0, (count, length - 1))
-        squared_error = (predicted - frames[:, 1:]).square().mean(dim=(0, 2, 3, 4)).sum()
+        vectors, places = vectors.unflatten(0, (count, length)), place_features(pushers)
+        posterior, prior = self.posterior(vectors[:, 1:]), self.prior(vectors[:, known])
+        changes = self._changes(vectors[:, known], actions, places[:, 1:], posterior.sample(generator))
+        moved = places[:, 1:] - places[:, known]
+        last = [known[step] for step in steps]
+        skips = [skip.unflatten(0, (count, length))[:, last].flatten(0, 1) for skip in skips]
+        told = torch.cat([changes, moved], dim=-1)[:, steps].flatten(0, 1)
+        images = self._decoded(told, skips, frames[:, last].flatten(0, 1)).unflatten(0, (count, len(steps)))
+        true = frames[:, [step + 1 for step in steps]]
+        squared_error = (images - true).square().mean() * (length - 1)
         return Losses(squared_error, kl_divergence(posterior, prior).sum(dim=1).mean())
 
-    def rollout(self, context: Float[Tensor, "B 2 3 side side"], actions: Float[Tensor, "B T1 3"]) -> Iterator[Tensor]:
+    def rollout(
+        self,
+        context: Float[Tensor, "B 2 3 side side"],
+        actions: Float[Tensor, "B T1 3"],
+        pushers: Float[Tensor, "B T2 2"],
+    ) -> Iterator[Tensor]:
         """Yield the frames (B, 3, side, side) after the context, one after the other; latents are the prior's means.
 
         Args:
             context: true frames in [0, 1].
             actions: the first one between the context's frames, then one for each frame that is predicted [m/s].
+            pushers: places of the pusher in the context and in each frame that is predicted [m].
         """
         vectors, skips = self._context(context)
-        yield from self._continued(vectors, skips, context[:, -1], actions)
+        yield from self._continued(vectors, skips, context[:, -1], actions, pushers)
 
     @torch.inference_mode()
     def _context(self, context: Float[Tensor, "B 2 3 side side"]) -> tuple[Float[Tensor, "B 2 g"], list[Tensor]]:
@@ -471,22 +494,23 @@ class FitVidModel(nn.Module):
         skips: list[Tensor],
         known: Float[Tensor, "_ 3 side side"],
         actions: Float[Tensor, "B T1 3"],
+        pushers: Float[Tensor, "B T2 2"],
     ) -> Iterator[Tensor]:
-        prior_state = frame_state = frame = None
-        for step in range(actions.shape[1]):
+        with torch.inference_mode():
+            places, length = place_features(pushers), actions.shape[1]
+            given = vectors[:, [min(step, CONTEXT - 1) for step in range(length)]]
+            changes = self._changes(given, actions, places[:, 1:], self.prior(given).mean)
+            told = torch.cat([changes, places[:, 1:] - places[:, [CONTEXT - 1]]], dim=-1)
+        for step in range(CONTEXT - 1, length):
             with torch.inference_mode():
-                vector = vectors[:, step] if frame is None else self._encoded(frame)[0]
-                prior, prior_state = self.prior(vector[:, None], prior_state)
-                inputs = [vector[:, None], actions[:, step : step + 1] / MAX_SPEED_M_S, prior.mean]
-                following, frame_state = self.frame_predictor(torch.cat(inputs, dim=-1), frame_state)
-                frame = self._decoded(following[:, 0], skips, known) if step + 1 >= CONTEXT else None
-            if frame is not None:
-                yield frame
+                frame = self._decoded(told[:, step], skips, known)
+            yield frame
 
     def predict(
         self,
         context_frames: Float[np.ndarray, "2 h w 3"],
         actions: Float[np.ndarray, "K T 3"],
+        pusher: Float[np.ndarray, "3"],
         *,
         between: Float[np.ndarray, "3"] | None = None,
     ) -> Float32[np.ndarray, "K T h w 3"]:
@@ -495,6 +519,7 @@ class FitVidModel(nn.Module):
         Args:
             context_frames: what was seen one action ago, and now, in [0, 1].
             actions: sequences [m/s].
+            pusher: its centre now [m]; it goes where actions take it.
             between: the action between the context's frames [m/s]; standing still if None.
 
         Raises:
@@ -507,11 +532,14 @@ class FitVidModel(nn.Module):
         context = torch.as_tensor(context_frames, dtype=torch.float32, device=device).permute(0, 3, 1, 2)
         first = np.zeros(_ACTION) if between is None else between
         all_actions = np.concatenate([np.broadcast_to(first, (len(actions), 1, _ACTION)), actions], axis=1)
-        given = torch.as_tensor(all_actions, dtype=torch.float32, device=device)
+        path = pusher_centres(pusher[:2], actions, PUSHER_CENTRE_Z_M)[..., :2]
+        before = np.broadcast_to(pusher[:2] - STEP_S * first[:2], (len(actions), 1, 2))
+        places = np.concatenate([before, path], axis=1)
+        given, told = (torch.as_tensor(one, dtype=torch.float32, device=device) for one in (all_actions, places))
         vectors, skips = self._context(context[None])  # once for all sequences
         parts = []
-        for part in given.split(_AT_ONCE):
-            futures = self._continued(vectors.expand(len(part), -1, -1), skips, context[None, -1], part)
+        for part, where in zip(given.split(_AT_ONCE), told.split(_AT_ONCE), strict=True):
+            futures = self._continued(vectors.expand(len(part), -1, -1), skips, context[None, -1], part, where)
             parts.append(torch.stack(list(futures), dim=1))
         return torch.cat(parts).movedim(2, -1).contiguous().cpu().numpy()
 
@@ -519,7 +547,7 @@ class FitVidModel(nn.Module):
 # Files of trained FitVid networks: safetensors with half-precision parameters, checked when read.
 
 
-FORMAT = "fitvid-2"
+FORMAT = "fitvid-3"
 _FILE = "fitvid.safetensors"
 
 
@@ -560,9 +588,7 @@ def read_fitvid(path: Path, precision: torch.dtype = torch.float32) -> FitVidMod
     """
     metadata, values = read_parameters(path, FORMAT, "video prediction network")
     try:
-        known = {"is_pooled": "1", **metadata}  # files of before say nothing of it
-        sizes = {size.name: int(known[size.name]) for size in fields(FitVidSettings)}
-        settings = FitVidSettings(**{**sizes, "is_pooled": bool(sizes["is_pooled"])})
+        settings = FitVidSettings(**{size.name: int(metadata[size.name]) for size in fields(FitVidSettings)})
     except (KeyError, ValueError) as error:
         raise CorruptFile(path, f"it holds no video prediction network of known size ({shown(error)})") from error
     with torch.device("meta"):  # what the file describes may be larger than what it holds

@@ -5,7 +5,7 @@ K sequences of T actions, a_k, are drawn around a mean, what the goal camera wou
     S_k = sum_t |I_k(t) - I_goal|^2,        mean <- sum_k w_k a_k,        w_k ~ exp(-(S_k - min S) / lambda)
 
 is repeated (MPPI; Williams et al., 2015); the first action of the mean is executed and everything begins again from
-what is then seen. Nothing here knows of objects, poses or light.
+what is then seen. Nothing here knows of objects, their poses or light.
 
 Deviations, and choices where the paper that is reproduced here says nothing but "visual foresight with FitVid": MPPI
 takes the place of the cross-entropy method of the original, and the whole image that of its designated pixels; lambda
@@ -44,6 +44,7 @@ class FramePredictor(Protocol):
         self,
         context_frames: Float[np.ndarray, "2 h w 3"],
         actions: Float[np.ndarray, "K T 3"],
+        pusher: Float[np.ndarray, "3"],
         *,
         between: Float[np.ndarray, "3"] | None = None,
     ) -> Float[np.ndarray, "K T h w 3"]:
@@ -52,6 +53,7 @@ class FramePredictor(Protocol):
         Args:
             context_frames: what was seen one action ago, and now.
             actions: sequences [m/s].
+            pusher: its centre now [m].
             between: the action between the two [m/s].
         """
         ...
@@ -142,19 +144,24 @@ class VisualForesight:
         self._mean = np.zeros((self.settings.horizon, 3))
 
     def plan(
-        self, context: Float[np.ndarray, "2 h w 3"], between: Float[np.ndarray, "3"] | None, rng: np.random.Generator
+        self,
+        context: Float[np.ndarray, "2 h w 3"],
+        pusher: Float[np.ndarray, "3"],
+        between: Float[np.ndarray, "3"] | None,
+        rng: np.random.Generator,
     ) -> ForesightPlan:
         """Plan in all rounds.
 
         Args:
             context: what was seen one action ago, and now.
+            pusher: its centre now [m].
             between: the action between the two [m/s].
             rng: draws the sequences.
         """
         began, costs = time.perf_counter(), np.zeros(0)
         for _ in range(self.settings.rounds):
             actions = self._sampled(rng)
-            costs = self._costs(self._predictor.predict(context, actions, between=between))
+            costs = self._costs(self._predictor.predict(context, actions, pusher, between=between))
             spread = max(float(np.median(costs) - costs.min()), 1e-12)
             weights = np.exp(-(costs - costs.min()) / (self.settings.temperature * spread))
             self._mean = np.einsum("k,kta->ta", weights / weights.sum(), actions)
@@ -198,23 +205,24 @@ def foresee(
     Raises:
         InvalidInput: if the world has no such camera.
     """
-    now = _view(world, goal)
+    now, pusher = _view(world, goal)
     before, action = now, None
     for number in range(steps):
-        plan = planner.plan(np.stack([before, now]), action, rng)
+        plan = planner.plan(np.stack([before, now]), pusher, action, rng)
         action = plan.actions[0]
         world.act(action)
         planner.shift()
         yield Foreseen(number, action, plan, now)
-        before, now = now, _view(world, goal)
+        before, (now, pusher) = now, _view(world, goal)
 
 
-def _view(world: World, goal: GoalImage) -> Float[np.ndarray, "h w 3"]:
-    """Return what the goal image's camera sees now."""
+def _view(world: World, goal: GoalImage) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "3"]]:
+    """Return what the goal image's camera sees now, and the pusher's centre."""
     seen = world.observe()
     for camera, image in zip(seen.cameras, seen.images, strict=True):
         if camera.name == goal.camera.name and image.shape == goal.image.shape:
-            return image
+            assert seen.pusher is not None  # for the type checker: a robot knows its hand
+            return image, seen.pusher
     sizes = [(camera.name, camera.width, camera.height) for camera in seen.cameras]
     raise InvalidInput("cameras of the world", sizes, f"among them {goal.camera.name!r} with the goal image's size")
 

@@ -177,6 +177,6 @@ def test_fitvid_sees_two_frames_and_the_actions(video, measure, monkeypatch, tmp
     context, frames = rng.random((2, 64, 64, 3)), rng.random((STEPS, 64, 64, 3))
     monkeypatch.setattr(videos, "simulate_video", lambda *_: replace(video, context=context, frames=frames))
     network = read_fitvid(tmp_path / "fitvid.safetensors")
-    expected = network.predict(context, video.actions[None], between=video.between)[0]
+    expected = network.predict(context, video.actions[None], video.look.pusher, between=video.between)[0]
     found = measure("fitvid", size=64).figures["psnr"]
     assert found == pytest.approx([psnr(true, image) for true, image in zip(frames, expected, strict=True)])

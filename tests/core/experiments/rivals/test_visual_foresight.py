@@ -40,7 +40,7 @@ class BlobWorld:
     def observe(self, *, masks=False):
         seen = {"goal": blob(self.place)}
         images = np.stack([seen.get(c.name, np.zeros((SIDE, SIDE, 3))) for c in self.cameras])
-        return Observation(self.cameras, images, (), None, None, 0.0)
+        return Observation(self.cameras, images, (), None, np.array([*self.place, 0.06]), 0.0)
 
     def act(self, action):
         self.actions.append(action)
@@ -56,8 +56,8 @@ class BlobPredictor:
     def __init__(self):
         self.asked = []
 
-    def predict(self, context_frames, actions, *, between=None):
-        self.asked.append((context_frames, actions, between))
+    def predict(self, context_frames, actions, pusher, *, between=None):
+        self.asked.append((context_frames, actions, pusher, between))
         x, y = np.meshgrid(AXIS, AXIS)
         height = context_frames[1, ..., 0]
         peak = np.unravel_index(height.argmax(), height.shape)
@@ -95,7 +95,8 @@ def test_the_predictor_gets_both_frames_and_the_action_between_them():
     world, steps = run((0.1, 0.0), settings=replace(SETTINGS, rounds=1), steps=3, predictor=predictor)
     assert [between is None for *_, between in predictor.asked] == [True, False, False]
     np.testing.assert_array_equal(predictor.asked[0][0][0], predictor.asked[0][0][1])
-    for (context, actions, between), before, now in zip(predictor.asked[1:], steps, steps[1:], strict=False):
+    for (context, actions, pusher, between), before, now in zip(predictor.asked[1:], steps, steps[1:], strict=False):
+        np.testing.assert_allclose(pusher[:2], STEP_S * sum(step.action[:2] for step in steps[: now.number]))
         np.testing.assert_array_equal(context[0], before.image)
         np.testing.assert_array_equal(context[1], now.image)
         np.testing.assert_array_equal(between, before.action)
@@ -108,11 +109,11 @@ def test_costs_are_squared_differences_from_the_goal_summed_over_steps():
     """Whatever is done, this predictor sees the same: half a unit away from the goal in every pixel."""
 
     class Constant:
-        def predict(self, context_frames, actions, *, between=None):
+        def predict(self, context_frames, actions, pusher, *, between=None):
             return np.full((*actions.shape[:2], SIDE, SIDE, 3), 0.5, np.float32)
 
     planner = foresight.VisualForesight(Constant(), np.zeros((SIDE, SIDE, 3)), SETTINGS)
-    plan = planner.plan(np.zeros((2, SIDE, SIDE, 3)), None, np.random.default_rng(0))
+    plan = planner.plan(np.zeros((2, SIDE, SIDE, 3)), np.zeros(3), None, np.random.default_rng(0))
     np.testing.assert_allclose(plan.costs, 4 * 0.25, atol=1e-12)
     assert np.abs(plan.actions).max() < MAX_SPEED_M_S  # equal costs: the mean of all
 
