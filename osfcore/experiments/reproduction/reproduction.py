@@ -511,7 +511,7 @@ def estimation_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
             values = [figures["moments"][key][n] for key in titles]
             rows.append([TITLES[method], moment, *("-" if value is None else f"{value:.3g}" for value in values)])
     text = (
-        f"{report['tasks']} first frames of {objects_in_words(report['objects'])}, medians. The published estimation "
+        f"First frames of {objects_in_words(report['objects'])}: {report['tasks']}, medians. The published estimation "
         "holds the light overhead for its first five iterations; ours reads it off the table's shadows early on. The "
         "green cube is where the light is taken to be, the white frame where it is."
     )
