@@ -80,6 +80,8 @@ class ViewIn(Input):
         description='Things as scanned meshes, as their neural "fields" render them, or only the "beliefs" about them.',
     )
 
+    goal: str | None = Field(None, description="Goal whose objects are drawn in gold on the live table, if known.")
+
 
 class ViewOut(BaseModel):
     """How a page's view is."""
@@ -92,7 +94,14 @@ def show(services: ServicesDep, visitor: VisitorPath, body: ViewIn) -> ViewOut:
     """Show an episode in the 3D view of one page, at `viewer/{visitor}/`, or the live table again."""
     with named_in_path():
         replay = None if body.replay is None else body.replay.replay(services)
-    return ViewOut(is_open=services.viewer.pages.ask(visitor, Wish(replay, body.shows)))
+        goal = None if body.goal is None else services.goals.get(body.goal)
+    return ViewOut(is_open=services.viewer.pages.ask(visitor, Wish(replay, body.shows, goal)))
+
+
+@views_router.post("/{visitor}/camera")
+def frame(services: ServicesDep, visitor: VisitorPath) -> ViewOut:
+    """Place the camera of one page's 3D view anew, so that the objects fill it."""
+    return ViewOut(is_open=services.viewer.pages.frame(visitor))
 
 
 presets_router = APIRouter(prefix="/api/presets", tags=["presets"], responses=problems(), route_class=BoundedRoute)

@@ -42,7 +42,8 @@ _VIEWER = re.compile(rf"/viewer(/{VISITOR})?/?")
 def client_page(request: Request, services: ServicesDep) -> HTMLResponse:
     """The viewer's client, one file; below what a page calls itself, it is the view of that page.
 
-    Scripts of ours come before its own: it makes functions from strings, and expects a graphics card.
+    Scripts of ours come before its own: it makes functions from strings, and expects a graphics card. A style of ours
+    lets the page's colour be around the table.
 
     It obeys its address: `websocket` and `playbackPath` name where its messages come from, and messages may hold
     scripts. So nothing but looks and this service's own relay (viser writes it there) may be asked for.
@@ -52,8 +53,9 @@ def client_page(request: Request, services: ServicesDep) -> HTMLResponse:
             raise HTTPException(400, f"The 3D view cannot be opened with {shown(name)!r}; open it from the page.")
     # no-cache, because a client of another version than the server is refused by it
     root = request.scope.get("root_path", "")
-    scripts = "".join(f'<script src="{root}/js/{name}"></script>' for name in _SCRIPTS)
-    client = services.viewer.client_page.read_text("utf-8").replace("<head>", f"<head>{scripts}", 1)
+    ours = f'<link rel="stylesheet" href="{root}/css/view.css">'
+    ours += "".join(f'<script src="{root}/js/{name}"></script>' for name in _SCRIPTS)
+    client = services.viewer.client_page.read_text("utf-8").replace("<head>", f"<head>{ours}", 1)
     return HTMLResponse(client, headers={"Cache-Control": "no-cache"})
 
 

@@ -23,7 +23,6 @@ from osfcore.geometry.poses import Pose, quaternion_multiply
 from osfcore.objects.asset_library import AssetLibrary
 
 WRONG = (225, 30, 35)
-_OPACITY = 0.55
 _GIZMO_M = 0.11
 _WORDS_AT = (0.0, 0.0, 0.3)
 
@@ -124,7 +123,7 @@ class _Copy:
         self._gizmo = scene.add_transform_controls(
             path, scale=_GIZMO_M, active_axes=(True, True, False), depth_test=False
         )
-        self._shape = add_copy(scene, f"{path}/shape", library, name, opacity=_OPACITY)
+        self._shape = add_copy(scene, f"{path}/shape", library, name)
 
         async def drag(event: viser.TransformControlsEvent) -> None:
             self._grip += event.phase == "start"

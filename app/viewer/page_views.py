@@ -14,23 +14,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import viser
+from jaxtyping import Float
 
 from app.episodes.trajectory import LookFrame, Moment, ReplayClock, Round, Trajectory, read_trajectory
 from app.processes.client import ProcessClient
+from app.services.event_hub import CurrentScene
+from app.storage.records import GoalRecord
 from app.viewer.drawing import Panel
 from app.viewer.neural_panel import NeuralPanel
-from app.viewer.nodes.episode_nodes import EpisodeNodes
+from app.viewer.nodes.episode_nodes import EpisodeNodes, add_copy
 from app.viewer.nodes.estimate_nodes import TRACKED
-from app.viewer.nodes.room import atomic
-from app.viewer.nodes.scene_nodes import LAMP, LIVE_NODES, SceneNodes
+from app.viewer.nodes.room import atomic, framing
+from app.viewer.nodes.scene_nodes import LAMP, LIVE_NODES, SceneNodes, extent_m
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.objects.asset_library import AssetLibrary
 
 DRAW_INTERVAL_S = 0.04
-_ROOT = "/replay"
+_ROOT, _CHOSEN = "/replay", "/chosen"
 # What one may choose not to see, below the root of what is on view.
 _TRACKED, _TRUTH = f"/episode/estimate/{TRACKED}", ("/objects", "/shadows", "/names")
 Shows = Literal["meshes", "fields", "beliefs"]
@@ -62,10 +66,12 @@ class Wish:
     Attributes:
         replay: an episode; None for the live table.
         shows: things as meshes, as their fields render them, or only what is believed of them.
+        goal: whose objects are drawn in gold on the live table, if their places are known.
     """
 
     replay: Replay | None = None
     shows: Shows = "meshes"
+    goal: GoalRecord | None = None
 
 
 class _View:
@@ -85,6 +91,7 @@ class _View:
         self.client = client
         self.nodes: ReplayNodes | None = None
         self._shown: tuple[Path, int] | None = None  # the file that they replay, and when it was last written
+        self._goal: tuple[str, list[viser.MeshHandle]] = "", []  # whose objects are golden, and their nodes
         self.picture = neural.add(
             client, lambda: (live(), "") if (nodes := self.nodes) is None else (nodes.table.state(), _ROOT)
         )
@@ -99,6 +106,25 @@ class _View:
             self.nodes.follow(read_trajectory(trajectory))
         self._shown = version
         return self.nodes
+
+    def show_goal(self, goal: GoalRecord | None, library: AssetLibrary) -> None:
+        """Show where objects of the live table should be."""
+        before, nodes = self._goal
+        name = "" if goal is None else goal.id
+        if name == before:
+            return
+        for node in nodes:
+            node.remove()
+        poses = () if goal is None else goal.poses or ()
+        nodes = [add_copy(self.client.scene, f"{_CHOSEN}/{of}", library, of) for of, _ in poses]
+        for node, (_, pose) in zip(nodes, poses, strict=True):
+            node.position, node.wxyz = pose.position, pose.quaternion
+        self._goal = name, nodes
+
+    def frame(self, points_m: Float[np.ndarray, "N 3"]) -> None:
+        """Let the camera stand where points fill the view [m]."""
+        camera = self.client.camera
+        camera.position, camera.look_at = framing(points_m, camera.fov, camera.aspect)
 
     def close(self) -> None:
         """Show the live table again."""
@@ -116,12 +142,14 @@ class _Page:
         since: when it asked, by the monotonic clock [s].
         view: once it is open; another one after each reload.
         is_due: whether there is something to draw.
+        framed: what the camera shall be placed for; None leaves it where it is.
     """
 
     wish: Wish = Wish()
     since: float = 0.0
     view: _View | None = None
     is_due: bool = False
+    framed: SceneState | None = None
 
 
 class PageViews(Panel):
@@ -151,6 +179,7 @@ class PageViews(Panel):
         self._page_of = page_of
         self._live = live
         self.neural = NeuralPanel(link, fields, library.label)
+        self._framed: str | None = None  # the scene for which the cameras were placed last
         self._pages: OrderedDict[str, _Page] = OrderedDict()  # guarded by `_thread.changed`, the newest wish last
 
     def ask(self, page: str, wish: Wish) -> bool:
@@ -168,8 +197,24 @@ class PageViews(Panel):
             known = self._page(page)
             if wish.replay != known.wish.replay:  # else only another look at it is wanted: what plays goes on
                 known.since = time.monotonic()
+            if wish.replay is None and known.wish.replay is not None:
+                known.framed = self._live()
             known.wish, known.is_due = wish, True
             return known.view is not None
+
+    def frame(self, page: str) -> bool:
+        """Place the camera of a page's view anew, so that the objects fill it. Any thread may call.
+
+        Returns:
+            Whether the view is open.
+        """
+        with self._thread.changing():
+            known = self._page(page)
+            view = known.view
+            if view is not None:
+                known.framed = self._live() if view.nodes is None else view.nodes.table.state()
+            known.is_due = True
+            return view is not None
 
     def add_client(self, client: viser.ClientHandle) -> None:
         """Show what a page has asked for in the browser that has opened its view, perhaps once more."""
@@ -180,6 +225,7 @@ class PageViews(Panel):
                 if known.view is not None:  # reloaded, and not known yet to have left
                     self.neural.remove(known.view.picture)
                 known.view, known.is_due = _View(client, self.neural, self._live), True
+                known.framed = self._live()
 
     def remove_client(self, client: viser.ClientHandle) -> None:
         """Forget a browser that has left; what its page has asked for is remembered."""
@@ -197,6 +243,16 @@ class PageViews(Panel):
         for other in idle[: max(len(self._pages) - _MOST_PAGES, 0)]:
             del self._pages[other]
         return known
+
+    def _store(self, event: object) -> bool:
+        """Frame what is on a table that was not on view before."""
+        match event:
+            case CurrentScene(record) if record is not None and record.id != self._framed:
+                self._framed = record.id
+                for page in self._pages.values():
+                    page.framed, page.is_due = record.state, True
+                return True
+        return False
 
     def _draw(self) -> None:
         with self._thread.changed:
@@ -218,20 +274,26 @@ class PageViews(Panel):
     def _draw_view(self, page: _Page, view: _View) -> None:
         with self._thread.changed:
             wish, since = page.wish, page.since
+            framed, page.framed = page.framed, None
         root, replay = "", wish.replay
+        view.show_goal(wish.goal if replay is None else None, self._library)
         if replay is None:
             view.close()
         else:
-            root = _ROOT
+            root, before = _ROOT, view.nodes
             at_s = replay.at_s + (replay.speed * (time.monotonic() - since) if replay.plays else 0.0)
             nodes = view.opened(replay.trajectory, self._library)
             nodes.at(at_s)
+            if nodes is not before:
+                framed = nodes.table.state()
             if replay.plays and at_s < nodes.clock.length_s:
                 with self._thread.changed:
                     page.is_due = True
                     self._thread.wake(DRAW_INTERVAL_S)
         hidden = _TRUTH if wish.shows == "beliefs" else (_TRACKED,)
         view.picture.hidden.hide("page", {f"{root}{path}" for path in hidden})
+        if framed is not None and framed.names:
+            view.frame(extent_m(framed, self._library))
         self.neural.switch(view.picture, is_on=wish.shows == "fields")
         self.neural.moved(view.picture)
 

@@ -163,7 +163,7 @@ class Viewer:
         gui = server.gui
         gui.configure_theme(show_share_button=False, show_logo=False, control_width="small")
         gui.set_panel_label("Scene")
-        self._wants_gizmos = gui.add_checkbox("Move objects", False, hint="Show handles to drag and turn the objects.")
+        self._wants_gizmos = gui.add_checkbox("Handles", False, hint="Show handles to lift and turn the objects.")
         cameras = gui.add_checkbox("Cameras", False)
         names = gui.add_checkbox("Names", True)
         gui.main_panel.minimize()
@@ -213,7 +213,9 @@ class Viewer:
         """Objects can be dragged while no job holds the scene and no goal is being composed."""
         current = self._runner.scenes.current
         is_free = current is not None and self._runner.jobs.holder(current) is None
-        self._drawing.show_gizmos(self._wants_gizmos.value and is_free and not self._goal_panel.is_composing)
+        is_free = is_free and not self._goal_panel.is_composing
+        self._drawing.let_grab(is_free)
+        self._drawing.show_gizmos(self._wants_gizmos.value and is_free)
 
 
 def release_memory() -> None:

@@ -1,5 +1,5 @@
 // The 3D view in its frame: the live table, or an episode in its place, as far as this page alone is concerned.
-import { VISITOR, put } from "./api.js";
+import { VISITOR, post, put } from "./api.js";
 import { byId } from "./dom.js";
 import { isDriving } from "./driver.js";
 import { LIVE } from "./jobs.js";
@@ -23,7 +23,6 @@ function tellNothing() {
 
 /** Loads the frame, again after the service was lost; what this page replays there is shown again by itself. */
 export function showViewer() {
-  // Of one look whatever the page's theme is: a table under a lamp is seen best before something dark.
   byId("viewer").src = `viewer/${VISITOR}/?hideViserLogo&darkMode`;
   byId("viewer").hidden = byId("shows").hidden = false;
   byId("viewer-wait").hidden = true;
@@ -34,7 +33,9 @@ export const isViewerShown = () => !byId("viewer").hidden;
 /** Whether the table that is pushed is the one on view. */
 export const isLiveShown = () => !replayed;
 
-const show = () => put(`views/${VISITOR}`, { replay: replayed, shows });
+/** What is golden: the goal that was chosen, until an episode has found its own. */
+const golden = () => (drawsHere(known("episode")) && known("episode").done > 0 ? null : known("goal")?.id ?? null);
+const show = () => put(`views/${VISITOR}`, { replay: replayed, shows, goal: golden() });
 const wish = new Newest(show);
 
 function ask(what) {
@@ -85,9 +86,18 @@ export function setUpViewer(listener) {
   watch("episode", pace);
   byId("viewer").addEventListener("load", () => {
     paceAgain();
-    if (replayed || shows !== "meshes") wish.ask(); // a service that was started again does not know
+    if (replayed || shows !== "meshes" || golden()) wish.ask(); // a service that was started again does not know
   });
   for (const what of ["episode", "estimate", "scene"]) watch(what, tellNothing);
+  let drawn = golden();
+  for (const what of ["goal", "episode", "scene"]) {
+    watch(what, () => {
+      if (drawn === golden()) return;
+      drawn = golden();
+      wish.ask();
+    });
+  }
+  byId("frame-view").addEventListener("click", () => tellFailure(() => post(`views/${VISITOR}/camera`)));
   for (const radio of document.getElementsByName("shows")) {
     radio.addEventListener("change", () => {
       shows = radio.value;

@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.viewer.nodes.room import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
+from app.viewer.nodes.room import VIEW_FOV_RAD, framing
+from app.viewer.nodes.scene_nodes import extent_m
 from osfcore.geometry.cameras import Camera
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import SceneState
 from tests.app.processes.fields import write_box, write_exact_table
 from tests.e2e.conftest import watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
@@ -72,10 +76,15 @@ def table_colour(page):
     return np.median(image[int(0.78 * height) : int(0.82 * height), int(0.3 * width) : int(0.4 * width)], axis=(0, 1))
 
 
-def pusher_centre(image, scene):
+def pusher_centre(image, scene, library):
     """Where the pusher is in a picture of the 3D view, by its colour [px]."""
     height, width, _ = image.shape
-    view = Camera.look_at("view", VIEW_FROM, VIEW_AT, size=height, fov_y_deg=np.rad2deg(VIEW_FOV_RAD))
+    things = scene["objects"]
+    poses = Pose(np.array([one["position"] for one in things]), np.array([one["quaternion"] for one in things]))
+    light, pusher = Light(np.array(scene["light"]["position"])), np.array(scene["pusher"]["position"])
+    seen = extent_m(SceneState(tuple(one["name"] for one in things), poses, light, pusher), library)
+    position, look_at = framing(seen, VIEW_FOV_RAD, width / height)
+    view = Camera.look_at("view", position, look_at, size=height, fov_y_deg=np.rad2deg(VIEW_FOV_RAD))
     at = view.project(np.array(scene["pusher"]["position"])) + [(width - height) / 2, 0]
     left, top = np.round(at).astype(int) - WINDOW_PX
     window = image[top : top + 2 * WINDOW_PX, left : left + 2 * WINDOW_PX]
@@ -123,22 +132,23 @@ def test_a_comparison_that_arrives_after_it_was_switched_off_is_not_shown(page):
     assert page.problems == []
 
 
-def test_the_neural_render_lies_where_the_meshes_were(page, url):
+def test_the_neural_render_lies_where_the_meshes_were(page, url, library):
     view = page.frame_locator("#viewer")
     view.locator("canvas").first.wait_for()
     listed = call(url, "scenes")
     scene = next(scene for scene in listed["scenes"] if scene["id"] == listed["current"])
+    page.click("#frame-view")
     wait_until(lambda: table_colour(page).min() > 60, DRAW_S)
     page.wait_for_timeout(1000)
-    colour, meshes = table_colour(page), pusher_centre(shot(page), scene)
+    colour, meshes = table_colour(page), pusher_centre(shot(page), scene, library)
     page.click("text=Neural fields")
     wait_until(lambda: np.all(colour - table_colour(page) > 15), COMPILE_S)
     page.wait_for_timeout(2000)  # until it is sharp
-    rendered = pusher_centre(shot(page), scene)
+    rendered = pusher_centre(shot(page), scene, library)
     assert np.abs(rendered - meshes).max() < 2
     page.click("text=Meshes")
     wait_until(lambda: np.all(np.abs(colour - table_colour(page)) < 3), DRAW_S)
-    assert np.abs(pusher_centre(shot(page), scene) - meshes).max() < 0.5
+    assert np.abs(pusher_centre(shot(page), scene, library) - meshes).max() < 0.5
 
 
 def test_an_object_without_a_field_is_named_under_the_cameras(page, url):

@@ -85,14 +85,14 @@ def settled(view, is_there):
 
 
 def has_bottle(pictures):
-    """Whether there is something yellow left of and in the middle of the table."""
-    spots = pictures.reshape(-1, 48, 48, 3)[:, 12:36, 10:29]
+    """Whether there is something yellow."""
+    spots = pictures.reshape(-1, 48, 48, 3)
     return ((spots[..., 0] > spots[..., 2] + 60) & (spots[..., 1] > spots[..., 2] + 30)).any((1, 2))
 
 
 def has_box(pictures):
-    """Whether there is something red right of the middle."""
-    spots = pictures.reshape(-1, 48, 48, 3)[:, 12:36, 29:38]
+    """Whether there is something red below the lamp's handle."""
+    spots = pictures.reshape(-1, 48, 48, 3)[:, :30]
     return ((spots[..., 0] > spots[..., 1] + 60) & (spots[..., 0] > spots[..., 2] + 60)).any((1, 2))
 
 

@@ -24,6 +24,10 @@ _FIELDS: Mapping[str, Set[str]] = {
     "TransformControlsUpdateMessage": {"type", "name", "wxyz", "position", "owner"},
     "TransformControlsDragStartMessage": {"type", "name", "owner"},
     DROP: {"type", "name", "owner"},
+    "SceneNodeDragMessage": {
+        "type", "phase", "name", "instance_index", "start_position", "start_screen_pos", "end_position",
+        "end_screen_pos", "button", "modifier", "owner",
+    },
 }  # fmt: skip
 
 
@@ -51,7 +55,9 @@ def _is_value(value: object) -> bool:
 
 
 def _is_plain(value: object) -> bool:
-    """A number, a short text or a few numbers."""
+    """A number, a short text, a few numbers or nothing."""
+    if value is None:
+        return True
     if isinstance(value, list):
         return len(value) <= 4 and all(_is_number(number) for number in value)
     return _is_value(value)

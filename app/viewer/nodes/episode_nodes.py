@@ -11,7 +11,7 @@ import viser
 from jaxtyping import Float, UInt8
 
 from app.viewer.nodes.estimate_nodes import EstimateNodes
-from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of, segments
+from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of, segments, shell
 from app.viewer.nodes.room import GAMMA, NO_LINES, Colour, Label, Target, atomic, colour_of
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState, SceneState
@@ -22,9 +22,9 @@ Part = Literal["goal", "plan", "estimate"]
 PARTS: tuple[Part, ...] = ("goal", "plan", "estimate")
 GOAL = (245, 140, 0)
 CHEAP, DEAR = (45, 215, 90), (150, 62, 58)
+GOAL_OPACITY = 0.6
 PLAY_S, REST_S = 2.0, 0.7  # how long the best future is played, and stands at its end
-_GOAL_OPACITY = 0.5
-_GOAL_SCALE = 1.015  # or ghosts and the surfaces below them would flicker
+_RIM_M = 0.004  # of gold around what stands in its place
 _WAY_M, _BEST_M = 0.0025, 0.007  # thickness
 _DEAREST_Z_M, _CHEAPEST_Z_M, _BEST_Z_M = 0.003, 0.006, 0.008  # cheap ways lie above dear ones
 
@@ -82,12 +82,8 @@ class EpisodeNodes:
             if set(poses) != set(self._goal):
                 for node in self._goal.values():
                     node.remove()
-                self._goal = {
-                    name: add_copy(
-                        self._scene, f"{self._root}/goal/where/{name}", self._library, name, opacity=_GOAL_OPACITY
-                    )
-                    for name in poses
-                }
+                where = f"{self._root}/goal/where"
+                self._goal = {name: add_copy(self._scene, f"{where}/{name}", self._library, name) for name in poses}
             for name, pose in poses.items():
                 self._goal[name].position, self._goal[name].wxyz = pose.position, pose.quaternion
             self._goal_look.clear()
@@ -156,14 +152,14 @@ class EpisodeNodes:
         self._best.points = segments(best)
 
 
-def add_copy(scene: viser.SceneApi, path: str, library: AssetLibrary, name: str, *, opacity: float) -> viser.MeshHandle:
-    """Add a golden copy of an object, which shows where it should be."""
+def add_copy(scene: viser.SceneApi, path: str, library: AssetLibrary, name: str) -> viser.MeshHandle:
+    """Add a golden shell of an object, which shows where it should be and leaves what stands there as it is."""
     return scene.add_mesh_simple(
         path,
-        *mesh_of(library, name, FINE_CELLS),
+        *shell(mesh_of(library, name, FINE_CELLS), _RIM_M),
         color=GOAL,
-        opacity=opacity,
-        scale=_GOAL_SCALE,
+        opacity=GOAL_OPACITY,
+        side="back",
         cast_shadow=False,
         receive_shadow=False,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import viser
@@ -22,9 +23,10 @@ PREDICTED, TRUE = (190, 50, 210), (25, 25, 25)  # neither is a colour of estimat
 UNKNOWN_M = 0.05  # the side of the cube for an object without a mesh
 _ARC_STEPS = 24
 _PUSHER_OPACITY = 0.35
-_SCALE = 1.008  # or ghosts and the surfaces below them would flicker
+_RIM_M = 0.002  # of a ghost around what stands in its place
+_VESSEL = 0.4  # a mesh that fills less than this share of its hull is a vessel
 _ARM_M = 0.05  # what turning by 1 rad counts on a way
-MOVED_M, _TURNED = 5e-4, 1e-3
+MOVED_M, _TURNED_RAD = 3e-3, 0.05  # what moves and turns less does not do so to the eye
 _log = logging.getLogger(__name__)
 Mesh = tuple[Float[np.ndarray, "P 3"], Int[np.ndarray, "F 3"]]
 
@@ -69,6 +71,35 @@ def mesh_of(library: AssetLibrary, name: str, cells: int = CELLS) -> Mesh:
     return coarse(mesh.vertices, mesh.faces, cells)
 
 
+def shell(mesh: Mesh, by_m: float) -> Mesh:
+    """Move the surface of a mesh outward.
+
+    Of a shell only the far side is drawn: around a thing that stands in it a rim shows, and where nothing stands, all.
+
+    Args:
+        mesh: vertices [m] and faces.
+        by_m: how far [m].
+    """
+    vertices, faces = _without_inside(mesh)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], np.cross(b - a, c - a))  # larger faces count more
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return vertices + np.float32(by_m) * normals, faces
+
+
+def _without_inside(mesh: Mesh) -> Mesh:
+    """Replace a vessel by its convex hull: both sides of its walls would lie in the same cells."""
+    import trimesh  # which the page's start need not wait for
+
+    solid = trimesh.Trimesh(*mesh, process=False)
+    hull = solid.convex_hull
+    if solid.volume > _VESSEL * hull.volume:
+        return mesh
+    return hull.vertices.astype(np.float32), hull.faces.astype(np.uint32)
+
+
 def add_ghosts(
     scene: viser.SceneApi,
     path: str,
@@ -80,6 +111,7 @@ def add_ghosts(
     scale: float = 1.0,
     shares: Float[np.ndarray, "N"] | None = None,
     is_wire: bool = False,
+    side: Literal["front", "back"] = "front",
 ) -> viser.BatchedMeshHandle:
     """Add a hidden node with translucent copies of a mesh, which cast no shadows and have no place yet.
 
@@ -93,6 +125,7 @@ def add_ghosts(
         scale: of the mesh; copies as large as the surfaces below them would flicker.
         shares: of the opacity that each copy has; None is all of it.
         is_wire: whether edges are drawn in place of faces.
+        side: of the faces that is drawn; of wires both are.
     """
     return scene.add_batched_meshes_simple(
         path,
@@ -104,7 +137,7 @@ def add_ghosts(
         batched_opacities=shares,
         opacity=opacity,
         wireframe=is_wire,
-        side="double" if is_wire else "front",
+        side="double" if is_wire else side,
         lod="off",
         cast_shadow=False,
         receive_shadow=False,
@@ -153,8 +186,8 @@ def spread(poses: Pose, count: int) -> Pose:
 def moves(poses: Pose) -> bool:
     """Check whether an object on its way goes or turns far enough to be seen."""
     shift = np.abs(poses.position - poses.position[0]).max()
-    turn = 1 - np.abs(poses.quaternion @ poses.quaternion[0]).min()
-    return bool(shift > MOVED_M or turn > _TURNED**2)
+    turn_rad = rotation_angle(poses.quaternion, poses.quaternion[0]).max()
+    return bool(shift > MOVED_M or turn_rad > _TURNED_RAD)
 
 
 def way_of(rollouts: Rollouts, number: int) -> Pose:
@@ -254,7 +287,7 @@ class FutureNodes:
         self._ghosts: dict[str, viser.BatchedMeshHandle] = {}
         self._pusher = scene.add_cylinder(
             f"{root}/pusher",
-            radius=PUSHER_RADIUS_M * _SCALE,
+            radius=PUSHER_RADIUS_M + _RIM_M,
             height=PUSHER_HEIGHT_M,
             color=PREDICTED,
             opacity=_PUSHER_OPACITY,
@@ -304,5 +337,5 @@ class FutureNodes:
     def _add_ghosts(self, name: str) -> viser.BatchedMeshHandle:
         style = self._style
         shares = np.array([*[style.pale] * style.on_the_way, *[1.0] * style.has_end, 1.0])
-        path, mesh, count = f"{self._root}/{name}", mesh_of(self._library, name, FINE_CELLS), len(shares)
-        return add_ghosts(self._scene, path, mesh, count, style.colour, style.opacity, scale=_SCALE, shares=shares)
+        mesh, path = shell(mesh_of(self._library, name, FINE_CELLS), _RIM_M), f"{self._root}/{name}"
+        return add_ghosts(self._scene, path, mesh, len(shares), style.colour, style.opacity, shares=shares, side="back")

@@ -16,9 +16,9 @@ from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.world.imaging import TABLE_ALBEDO
 
 # From where the goal camera is, further back: the whole table is in view, and left is left as in the goal image.
+# `framing` looks from the same direction.
 VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.0, -1.31, 0.97), (0.0, 0.02, 0.0), 0.7
 TABLE_THICKNESS_M = 0.04
-AXES_M = 0.12  # arrows on the table's corner, so that "push toward +x" means something
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 NO_LINES = np.zeros((1, 2, 3), np.float32)  # viser has no node of no lines
 GAMMA = 2.2  # of viser's colours
@@ -46,16 +46,51 @@ def add_room(server: viser.ViserServer) -> None:
         position=(0.0, 0.0, -TABLE_THICKNESS_M / 2),
         cast_shadow=False,
     )
-    corner = (0.06 - TABLE_SIDE_M / 2, 0.06 - TABLE_SIDE_M / 2, 0.002)
-    scene.add_frame("/axes", position=corner, axes_length=AXES_M, axes_radius=0.004, origin_radius=0.006)
-    for name, offset in (("x", (AXES_M, 0, 0)), ("y", (0, AXES_M, 0))):
-        scene.add_label(f"/axes/{name}", name, position=offset, font_screen_scale=0.8)
 
 
 def colour_of(shares: Iterable[float]) -> Colour:
     """Convert three shares of red, green and blue, such as an albedo, to a colour as viser takes it."""
     red, green, blue = (round(255 * share) for share in shares)
     return red, green, blue
+
+
+# The camera
+
+# Shares of half the view that stay free: left and right, below (where the page's own buttons are) and above (labels).
+_FREE_SIDES, _FREE_BELOW, _FREE_ABOVE = 0.06, 0.2, 0.16
+_NEAREST_M = 0.6
+
+
+def framing(
+    points_m: Float[np.ndarray, "N 3"], fov_rad: float, aspect: float
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Place a camera as near as it can be while all points are in view.
+
+    With x, y, z along the camera's right, up and forward axes and the camera at (a, b, -d), a point is in view if
+    -l (z + d) <= x - a <= r (z + d), and likewise for y. Both sides together bound d from below; the largest bound
+    wins, and the points are put in the middle of what the other axis leaves free.
+
+    Args:
+        points_m: to be seen, in the world [m].
+        fov_rad: vertical field of view [rad].
+        aspect: the view's width divided by its height.
+
+    Returns:
+        Where the camera stands and the point that it looks at, in the world [m].
+    """
+    axes = Camera.look_at("view", VIEW_FROM, VIEW_AT).T_world_camera.apply(np.eye(3)) - np.asarray(VIEW_FROM)
+    right, up, forward = axes[0], -axes[1], axes[2]
+    reach = np.tan(fov_rad / 2)
+    sides = [
+        (points_m @ right, reach * aspect * (1 - _FREE_SIDES), reach * aspect * (1 - _FREE_SIDES)),
+        (points_m @ up, reach * (1 - _FREE_BELOW), reach * (1 - _FREE_ABOVE)),
+    ]
+    depth = points_m @ forward
+    bounds = [((-at - low * depth).max(), (at - high * depth).max(), low, high) for at, low, high in sides]
+    back = max(_NEAREST_M - depth.mean(), *((below + above) / (low + high) for below, above, low, high in bounds))
+    a, b = ((above - high * back + low * back - below) / 2 for below, above, low, high in bounds)
+    position = a * right + b * up - back * forward
+    return position, position + (back + depth.mean()) * forward
 
 
 # Changes
@@ -130,8 +165,8 @@ def separated(
 # Lights
 
 LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
-AT = 0.66  # where the dot stands on the way from the table's centre to the light
-_RAY = (0.46, AT)  # where the line begins and ends
+AT = 0.5  # where the dot stands on the way from the table's centre to the light
+_RAY = (0.35, AT)  # where the line begins and ends
 _DOT_PX, _RAY_PX = 15.0, 2.5
 _DOT = np.array([[[0, 0, 0], [0, 0, 1e-4]]], np.float32)  # a line this short is its own two round ends
 

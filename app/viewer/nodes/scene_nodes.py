@@ -44,6 +44,7 @@ LIVE_NODES = (
 # that was hidden is put up again.
 LAMP = "/lamp"
 LABEL_GAP_M = 0.01
+_SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of the corners of a box
 _NUDGE = 1e-7  # viser sends nothing that is as it was
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
@@ -86,7 +87,7 @@ class SceneNodes:
         self._grabbed: dict[str, np.ndarray] = {}
         self._is_light_held = False
         self._has_names = True
-        self._has_gizmos = False
+        self._has_gizmos = self._is_grabbable = False
         self._light_requests: dict[str, tuple[bool, str]] = {}  # whether it is visible, and the text beside it
         self._shadows = ShadowNodes(self._scene, library, f"{root}/shadows")
         self._pusher = self._scene.add_cylinder(
@@ -204,6 +205,14 @@ class SceneNodes:
             for gizmo in self._gizmos.values():
                 gizmo.visible = is_on
 
+    def let_grab(self, is_on: bool) -> None:
+        """Let objects be dragged over the table, or drags turn the view wherever they begin."""
+        with self._lock:
+            if is_on != self._is_grabbable:
+                self._is_grabbable = is_on
+                for name in self._bodies:
+                    self._bind_drag(name)
+
     def put_handles_back(self) -> None:
         """Send where the handles are once more: a browser may have moved its own."""
         with self._lock:
@@ -216,7 +225,7 @@ class SceneNodes:
         self, on_light: Callable[[Light, Client], None], start: tuple[float, float, float]
     ) -> viser.TransformControlsHandle:
         gizmo = self._scene.add_transform_controls(
-            f"{self._root}/light_handle", scale=0.12, disable_rotations=True, position=start, depth_test=False
+            f"{self._root}/light_handle", scale=0.08, disable_rotations=True, position=start, depth_test=False
         )
 
         async def drag(event: viser.TransformControlsEvent) -> None:
@@ -268,6 +277,39 @@ class SceneNodes:
         )
         if self._on_move is not None:
             self._gizmos[name] = self._add_handle(name, self._on_move)
+            self._bind_drag(name)
+
+    def _bind_drag(self, name: str) -> None:
+        """Let a hand take hold of an object itself, or no longer."""
+        body, on_move = self._bodies[name], self._on_move
+        if not isinstance(body, viser.GlbHandle) or on_move is None:
+            return
+        if not self._is_grabbable:
+            body.remove_drag_callback()
+            return
+        offset_m = np.zeros(3)  # from the object's origin to where the hand has it
+
+        async def drag(event: viser.SceneNodeDragEvent[viser.GlbHandle]) -> None:
+            nonlocal offset_m
+            with self._lock:
+                if (held := self._bodies.get(name)) is None:
+                    return
+                before = np.asarray(held.position, float)
+                if event.phase == "start":
+                    self._grabbed[name] = np.array(held.wxyz)
+                    offset_m = np.asarray(event.start_position, float) - before
+                pointed = np.asarray(event.end_position, float)
+                at = level_point(np.asarray(event.client.camera.position), pointed, before[2] + offset_m[2])
+                pose = Pose(before if at is None else at - offset_m, np.array(held.wxyz, float))
+                put(held, pose.position)
+                self._place_labels()
+                self._draw_shadows()
+            self._on_change()
+            if event.phase == "end":
+                self._grabbed.pop(name, None)
+                on_move(name, pose, event.client)
+
+        body.on_drag(drag)
 
     def _add_handle(self, name: str, on_move: Callable[[str, Pose, Client], None]) -> viser.TransformControlsHandle:
         gizmo = self._scene.add_transform_controls(
@@ -321,6 +363,38 @@ class SceneNodes:
             self._light_gizmo.visible = is_on
         colour = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR
         self._marker.show(is_on=is_on, has_ray=self._pusher.visible, text=name, colour=colour)
+
+
+def level_point(
+    eye: Float[np.ndarray, "3"], through: Float[np.ndarray, "3"], height_m: float
+) -> Float[np.ndarray, "3"] | None:
+    """Return where a ray from the eye through a point meets a level; None off the table, or if it never does.
+
+    Args:
+        eye: where the ray begins [m].
+        through: a point on it [m].
+        height_m: of the level above the table [m].
+    """
+    slope = eye[2] - through[2]
+    if not slope > 1e-6 or not eye[2] > height_m:
+        return None
+    point = eye + (eye[2] - height_m) / slope * (through - eye)
+    return point if np.abs(point[:2]).max() <= TABLE_SIDE_M / 2 else None
+
+
+def extent_m(state: SceneState, library: AssetLibrary) -> Float[np.ndarray, "P 3"]:
+    """Return points around all that a scene shows: corners of boxes around things, and the lamp's mark [m]."""
+    corners = [np.asarray(AT * state.light.position)[None]]
+    if state.pusher is not None:
+        half = np.array([PUSHER_RADIUS_M, PUSHER_RADIUS_M, PUSHER_HEIGHT_M / 2])
+        corners.append(state.pusher + half * _SIGNS)
+    for name in state.names:
+        try:
+            half = library.size_m(name) / 2
+        except OsfError:  # removed since
+            half = np.full(3, UNKNOWN_M / 2)
+        corners.append(state.pose(name).apply(half * _SIGNS))
+    return np.concatenate(corners)
 
 
 def light_toward(position: np.ndarray) -> Light | None:

@@ -92,6 +92,18 @@ class ViewerDriver:
             for callback in handles._impl_aux.update_cb:
                 asyncio.run(callback(SimpleNamespace(client=self.client, target=handles, phase=phase)))
 
+    def drag_body(self, path, eye, grip, to):
+        """Take hold of a node itself where it is seen from an eye, and let it go elsewhere."""
+        camera = SimpleNamespace(camera=SimpleNamespace(position=eye), add_notification=lambda *_, **__: None)
+        for phase, end in (("start", grip), ("update", to), ("end", to)):
+            event = SimpleNamespace(client=camera, phase=phase, start_position=grip, end_position=end)
+            for entry in self.node(path)._impl.drag_cb:
+                asyncio.run(entry.callback(event))
+
+    def is_draggable(self, path):
+        """Whether a hand can take hold of a node itself."""
+        return bool(self.node(path)._impl.drag_cb)
+
     def node(self, path):
         """A node of the scene; None if there is none."""
         return self.server.scene.get_handle_by_name(path)

@@ -170,6 +170,40 @@ def test_a_page_that_only_watches_moves_its_camera_and_nothing_else(live):
         button.remove()
 
 
+def test_a_chosen_goal_is_golden_on_the_live_table_alone(live, shown):
+    poses = [{"name": o["name"], "position": o["position"], "quaternion": o["quaternion"]} for o in shown["objects"]]
+    poses[0]["position"][0] += 0.05
+    status, goal = live.request("POST", "/api/goals", {"scene": shown["id"], "objects": poses, "name": "Aside"})
+    assert status == 201, goal
+    name = goal["objects"][0]["name"]
+    with opened(live, "page") as page:
+        ask(live, "page", goal=goal["id"])
+        node = until(lambda: page.own(f"/chosen/{name}"))
+        until(lambda: np.allclose(node.position, goal["objects"][0]["position"], atol=1e-6))
+        ask(live, "page", {"story": STORY, "at_s": 0.0}, goal=goal["id"])
+        until(lambda: page.own(f"/chosen/{name}") is None)
+        ask(live, "page")
+    assert live.request("PUT", "/api/views/page", {"goal": "no such goal"})[0] == 404
+
+
+def test_the_camera_frames_another_table_a_replay_and_on_request_what_is_there(live, shown):
+    with opened(live, "page") as page:
+        until(lambda: not np.allclose(page.camera.position, CAMERA["position"]))  # framed as it opened
+        first = np.array(page.camera.position)
+        page.send(msgspec.msgpack.encode(CAMERA))
+        until(lambda: np.allclose(page.camera.position, CAMERA["position"]))
+        assert live.request("POST", "/api/views/page/camera")[1] == {"is_open": True}
+        until(lambda: np.allclose(page.camera.position, first))
+        ask(live, "page", {"story": STORY, "at_s": 0.0})
+        until(lambda: not np.allclose(page.camera.position, first))
+        ask(live, "page")
+        until(lambda: np.allclose(page.camera.position, first))
+        _, other = live.request("POST", "/api/scenes", {"seed": 9, "objects": ["009_gelatin_box"]})
+        until(lambda: not np.allclose(page.camera.position, first))
+        live.request("DELETE", f"/api/scenes/{other['id']}")
+    assert live.request("POST", "/api/views/closed/camera")[1] == {"is_open": False}
+
+
 def test_what_was_asked_for_is_shown_once_the_view_opens_and_again_after_a_reload(live, course):
     assert not ask(live, "late", {"story": STORY, "at_s": 0.0})
     for _ in range(2):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.viewer.nodes.room import AT, CHARACTER, LINE, VIEW_AT, VIEW_FOV_RAD, VIEW_FROM, separated
-from app.viewer.nodes.scene_nodes import SceneNodes, clipped, light_toward, shadow_colour, shadow_mesh
+from app.viewer.nodes.room import AT, CHARACTER, LINE, VIEW_AT, VIEW_FOV_RAD, VIEW_FROM, framing, separated
+from app.viewer.nodes.scene_nodes import SceneNodes, clipped, level_point, light_toward, shadow_colour, shadow_mesh
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import quaternion_multiply
@@ -168,6 +168,47 @@ def test_lit_like_the_table_a_shadow_is_what_the_ambient_light_leaves(cosine):
     linear = [(channel / 255) ** 2.2 for channel in shadow_colour(cosine)]
     lit = np.array(linear) * (AMBIENT + (1 - AMBIENT) * cosine)
     np.testing.assert_allclose(lit, np.array(TABLE_ALBEDO) ** 2.2 * AMBIENT, rtol=0.03)
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-0.4, 0.4)] * 3), min_size=2, max_size=8), st.floats(0.4, 1.2), st.floats(0.4, 2.5)
+)
+def test_a_framed_view_holds_all_points_and_not_much_more(points, fov_rad, aspect):
+    points = np.array(points)
+    position, look_at = framing(points, fov_rad, aspect)
+    view = Camera.look_at("view", position, look_at, size=100, fov_y_deg=float(np.rad2deg(fov_rad)))
+    x, y = (2 * view.project(points) / 100 - 1).T
+    x = x / aspect
+    assert np.abs(x).max() < 1
+    assert np.abs(y).max() < 1
+    spans = np.ptp(x), np.ptp(y)
+    is_near = np.linalg.norm(position - look_at) < 0.61
+    assert is_near or max(spans) > 0.8  # of 2, from edge to edge
+
+
+def test_a_hand_that_points_at_a_level_meets_it_there_and_the_sky_nowhere():
+    eye, point = np.array([0.0, -1.0, 1.0]), np.array([0.1, 0.2, 0.05])
+    assert level_point(eye, eye + 0.3 * (point - eye), 0.05) == pytest.approx(point)
+    assert level_point(eye, eye + [0.0, 1.0, 0.1], 0.05) is None
+    assert level_point(eye, np.array([0.0, 3.0, 0.5]), 0.0) is None  # beyond the table
+
+
+def test_an_object_is_dragged_over_the_table_until_a_goal_is_composed(live, browser, shown):
+    until(lambda: browser.table_agrees(shown))
+    body = until(lambda: browser.node(f"/objects/{BOX}"))
+    before = np.array(body.position)
+    eye, grip = before + [0.0, -1.0, 1.0], before + [0.0, 0.0, 0.02]
+    browser.drag_body(f"/objects/{BOX}", eye, grip, grip + [0.1, 0.05, 0.0])
+
+    def went():
+        after = live.request("GET", f"/api/scenes/{shown['id']}")[1]["objects"][0]["position"]
+        return np.allclose(np.array(after[:2]) - before[:2], [0.1, 0.05], atol=5e-3)
+
+    until(went)
+    live.request("POST", "/api/goals/draft", {"scene": None})
+    until(lambda: not browser.is_draggable(f"/objects/{BOX}"))
+    live.request("DELETE", "/api/goals/draft")
+    until(lambda: browser.is_draggable(f"/objects/{BOX}"))
 
 
 VIEW = Camera.look_at("view", VIEW_FROM, VIEW_AT, fov_y_deg=float(np.rad2deg(VIEW_FOV_RAD)))

@@ -29,14 +29,14 @@ def test_a_dropped_object_falls_and_one_in_another_goes_back(live, browser, show
 
 def test_handles_show_only_when_wanted(live, browser, shown):
     assert not any(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE))
-    browser.set("Move objects", True)
+    browser.set("Handles", True)
     until(lambda: all(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
-    browser.set("Move objects", False)
+    browser.set("Handles", False)
     until(lambda: not any(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
 
 
 def test_a_goal_is_composed_with_handles_of_its_own(live, browser, shown):
-    browser.set("Move objects", True)
+    browser.set("Handles", True)
     until(lambda: all(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
     live.request("POST", "/api/goals/draft", {"scene": None})
     until(lambda: browser.below("/goal/objects") == {BOX, BOTTLE})
@@ -49,7 +49,7 @@ def test_a_goal_is_composed_with_handles_of_its_own(live, browser, shown):
     live.request("DELETE", "/api/goals/draft")
     until(lambda: browser.below("/goal/objects") == set())
     until(lambda: all(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
-    browser.set("Move objects", False)
+    browser.set("Handles", False)
 
 
 def test_an_episode_on_the_table_is_drawn_in_place_of_an_estimate(live, browser, shown):
