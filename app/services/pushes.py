@@ -26,62 +26,38 @@ from osfcore.paper.method import Method
 
 MAX_ACTIONS = 50
 _STILL_M = 1e-9
+_BEYOND_M = 0.05
 
 
-def straight(heading_rad: float, speed_m_s: float, count: int) -> Float[np.ndarray, "T 3"]:
-    """The same action again and again.
-
-    Args:
-        heading_rad: from +x toward +y.
-        speed_m_s: along the heading.
-        count: of actions.
-    """
-    velocity = speed_m_s * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
-    return np.tile(velocity, (count, 1))
-
-
-def along(
-    start: Float[np.ndarray, "2"], waypoints: Float[np.ndarray, "P 2"], speed_m_s: float
-) -> Float[np.ndarray, "T 3"]:
-    """Actions that lead from one waypoint to the next, each straight and with as many equal actions as it takes.
+def toward(start: Float[np.ndarray, "2"], target: Float[np.ndarray, "2"], speed_m_s: float) -> Float[np.ndarray, "T 3"]:
+    """Return equal actions [m/s] that lead straight from one place to another, as few as it takes.
 
     Args:
         start: where the pusher is [m].
-        waypoints: where it is to go [m]; what is beyond its reach is brought back to the edge.
+        target: where it is to go [m]; what is beyond its reach is brought back to the edge.
         speed_m_s: not to be exceeded, nor are 0.3 m/s on an axis.
 
     Raises:
         InvalidInput: if the way is empty, not finite or takes more than 50 actions.
     """
-    if not np.all(np.isfinite(waypoints)):
-        raise InvalidInput("waypoints [m]", waypoints.tolist(), "finite")
-    actions, here = [], np.asarray(start, float)
-    for waypoint in np.clip(waypoints, -PUSHER_REACH_M, PUSHER_REACH_M):
-        way, here = waypoint - here, waypoint
-        most = max(float(np.linalg.norm(way)) / speed_m_s, float(np.abs(way).max()) / MAX_SPEED_M_S)
-        count = int(np.ceil(most / STEP_S - 1e-9))
-        if np.abs(way).max() > _STILL_M:
-            actions += [(*(way / (max(count, 1) * STEP_S)), 0.0)] * max(count, 1)
-    if not 1 <= len(actions) <= MAX_ACTIONS:
-        raise InvalidInput("number of actions on this path", len(actions), f"between 1 and {MAX_ACTIONS}")
-    return np.clip(np.array(actions), -MAX_SPEED_M_S, MAX_SPEED_M_S)
+    if not np.all(np.isfinite(target)):
+        raise InvalidInput("place to push to [m]", target.tolist(), "finite")
+    way = np.clip(target, -PUSHER_REACH_M, PUSHER_REACH_M) - start
+    least_s = max(float(np.linalg.norm(way)) / speed_m_s, float(np.abs(way).max()) / MAX_SPEED_M_S)
+    count = int(np.ceil(least_s / STEP_S - 1e-9))
+    if not 1 <= count <= MAX_ACTIONS:
+        raise InvalidInput("number of actions on this way", count, f"between 1 and {MAX_ACTIONS}")
+    velocity = np.clip(way / (count * STEP_S), -MAX_SPEED_M_S, MAX_SPEED_M_S)
+    return np.tile([*velocity, 0.0], (count, 1))
 
 
-def way(start: Float[np.ndarray, "2"], actions: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T1 2"]:
-    """Where actions lead the pusher, the start included, as long as nothing is in its way [m]."""
-    places = [np.asarray(start, float)]
-    for action in actions:
-        places.append(np.clip(places[-1] + STEP_S * action[:2], -PUSHER_REACH_M, PUSHER_REACH_M))
-    return np.array(places)
-
-
-def toward_nearest(state: SceneState) -> tuple[float, float]:
-    """Heading [rad] and distance [m] from the pusher to the nearest object; 0 without pusher or object."""
+def beyond_nearest(state: SceneState) -> Float[np.ndarray, "2"] | None:
+    """Return the point 5 cm beyond the middle of the object nearest to the pusher [m]; None without the two."""
     if state.pusher is None or not state.names:
-        return 0.0, 0.0
+        return None
     ways = state.poses.position[:, :2] - state.pusher[:2]
-    x, y = ways[int(np.linalg.norm(ways, axis=1).argmin())]
-    return float(np.arctan2(y, x)), float(np.hypot(x, y))
+    nearest = ways[int(np.linalg.norm(ways, axis=1).argmin())]
+    return state.pusher[:2] + nearest * (1 + _BEYOND_M / max(float(np.linalg.norm(nearest)), _STILL_M))
 
 
 @dataclass(frozen=True, slots=True)

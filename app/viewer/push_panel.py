@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
@@ -20,19 +20,20 @@ from jaxtyping import Float
 from app.processes.messages.neural_messages import NeuralAnswer, Predicted
 from app.processes.messages.scene_messages import SceneChanged, SceneRecord
 from app.services.event_hub import CurrentScene
-from app.services.pushes import MAX_ACTIONS, Outcome, Predictions, along, outcomes, straight, toward_nearest, way
+from app.services.pushes import MAX_ACTIONS, Outcome, Predictions, beyond_nearest, outcomes, toward
 from app.viewer.drawing import DrawingThread, Panel, RunCommand, status
-from app.viewer.nodes.push_nodes import FEWEST, MOST, PushNodes, Waypoints
-from app.viewer.nodes.scene_nodes import Client
+from app.viewer.nodes.push_nodes import PushNodes
+from app.viewer.nodes.scene_nodes import Client, level_point
 from osfcore.errors import OsfError
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import MAX_SPEED_M_S, STEP_S
+from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
 from osfcore.objects.asset_library import AssetLibrary
 
+_SPEED = 0.05, MAX_SPEED_M_S  # slowest and fastest
 TICK_S = 0.03  # between two pictures of a moving ghost
 _KEY = "viewer"
-_IDLE = "Choose a push, then Predict"
+_IDLE = "No push is chosen yet"
 _EXECUTING, _EXECUTED = "Executing", "Executed. Purple: predicted; black: the true ways"
 _CHANGED = "The table has changed; predict again"
 Act = Callable[[str, list[np.ndarray]], SceneRecord]
@@ -48,7 +49,9 @@ class PushPanel(Panel):
     Args:
         server: whose panel gets the folder.
         library: meshes, symmetries and labels of the objects.
+        pusher: the node that is dragged to choose a push.
         predictions: predicts pushes.
+        commands: carries out what hands do; viser's loop must not wait for it.
         act: executes actions in a scene and returns the scene afterwards.
         run_command: carries out a command and notifies its client if it is refused.
     """
@@ -57,13 +60,15 @@ class PushPanel(Panel):
         self,
         server: viser.ViserServer,
         library: AssetLibrary,
+        pusher: viser.CylinderHandle,
         predictions: Predictions,
+        commands: Executor,
         act: Act,
         run_command: RunCommand,
     ) -> None:
         super().__init__("push-panel", TICK_S)
         self._library = library
-        self._predictions = predictions
+        self._predictions, self._commands = predictions, commands
         self._act = act
         self._run_command = run_command
         self._nodes = PushNodes(server, library)
@@ -73,20 +78,22 @@ class PushPanel(Panel):
         self._take_answer: Callable[[], None] | None = None  # what to do with one that has come
         self._message = _IDLE
         self._executing: PushPrediction | None = None
-        self._has_plan = False  # whether anybody has begun to choose a push
-        gui = server.gui
-        with gui.add_folder("What will a push do?", expand_by_default=False):
-            gui.add_markdown("Starts from the **true poses** in the simulator.")
-            self._controls = PushControls(server, self._replan)
-            predict = gui.add_button("Predict", color="violet")
+        self._target: np.ndarray | None = None  # where the pusher shall go, once somebody has chosen
+        self._gui = gui = server.gui
+        with gui.add_folder("What will a push do?"):
+            gui.add_markdown("Drag the pusher at an object. Predicted from the **true poses** in the simulator.")
+            nearest = gui.add_button("Predict toward the nearest", color="violet")
+            self._speed = gui.add_slider("Speed, m/s", *_SPEED, 0.01, 0.25)
             self._execute_button = gui.add_button(
-                "Execute", disabled=True, hint="Carry out these very actions in the simulator, and compare."
+                "Push", disabled=True, hint="Carry out these very actions in the simulator, and compare."
             )
             self._status = gui.add_html(status("push", _IDLE))
             self._report = gui.add_html("", visible=False)
             self._player = PushPlayer(gui, self._thread)
             gui.add_button("Clear", hint="Remove what is drawn of a push.").on_click(lambda _: self._forget())
-        predict.on_click(lambda event: self._run_command(partial(self._predict, event.client), event.client))
+        nearest.on_click(lambda event: self._run_command(partial(self._predict_nearest, event.client), event.client))
+        self._speed.on_update(lambda event: None if event.client is None else self._aim(None))
+        pusher.on_drag(self._drag)
         self._execute_button.on_click(lambda event: self._run_command(self._execute, event.client))
 
     def _store(self, event: object) -> bool:
@@ -102,16 +109,27 @@ class PushPanel(Panel):
                 return False
         return True
 
-    def _replan(self) -> None:
-        """Another push is chosen: what was predicted, or executed, is about a former one."""
+    async def _drag(self, event: viser.SceneNodeDragEvent[viser.CylinderHandle]) -> None:
+        """Let the way of the pusher follow a hand, and predict where it leads once it is let go."""
+        eye, through = np.asarray(event.client.camera.position), np.asarray(event.end_position, float)
+        target = level_point(eye, through, float(event.start_position[2]))
+        if target is not None:
+            grip = np.asarray(event.start_position, float) - np.asarray(event.target.position, float)
+            self._aim(np.clip((target - grip)[:2], -PUSHER_REACH_M, PUSHER_REACH_M))
+        if event.phase == "end":
+            self._gui.main_panel.expand()  # what is predicted is told there
+            self._commands.submit(self._run_command, partial(self._predict, event.client), event.client)
+
+    def _aim(self, target: Float[np.ndarray, "2"] | None) -> None:
+        """Choose another push: what was predicted, or executed, is about a former one."""
         with self._thread.changing():
-            self._has_plan = True
+            self._target = target
             if self._executing is None:
                 self._prediction, self._message = None, _IDLE
 
     def _forget(self) -> None:
         with self._thread.changing():
-            self._prediction, self._message, self._has_plan = None, _IDLE, False
+            self._prediction, self._message, self._target = None, _IDLE, None
 
     def _say(self, text: str) -> None:
         with self._thread.changing():
@@ -119,17 +137,20 @@ class PushPanel(Panel):
 
     # Predicting and executing; called in viser's pool
 
+    def _predict_nearest(self, client: Client) -> None:
+        self._aim(beyond_nearest(self._predictions.current().state))
+        self._predict(client)
+
     def _predict(self, client: Client) -> None:
         try:
             record = self._predictions.current()
-            actions = self._controls.actions(record.state)
+            actions = self._actions(record.state)
             is_warm = self._predictions.is_warm
             answer = self._predictions.submit(record.state, actions[None], _KEY)
         except OsfError as error:
             self._say(str(error))
             raise
         with self._thread.changing():
-            self._has_plan = True
             self._message = "Predicting" if is_warm else "Loading the network, some seconds the first time"
 
         def receive(done: Future[NeuralAnswer]) -> None:
@@ -138,11 +159,21 @@ class PushPanel(Panel):
 
         answer.add_done_callback(receive)
 
+    def _actions(self, state: SceneState) -> Float[np.ndarray, "T 3"]:
+        """The chosen push from a state [m/s].
+
+        Raises:
+            InvalidInput: if it goes nowhere, or takes too many actions.
+        """
+        start = np.zeros(2) if state.pusher is None else state.pusher[:2]
+        target = start if self._target is None else self._target
+        return toward(start, target, number_between(self._speed.value, *_SPEED))
+
     def _execute(self) -> None:
         with self._thread.changing():
             prediction = self._prediction
             if prediction is None or prediction.is_executed or self._executing is not None:
-                raise CannotExecute("There is no new prediction to execute; press Predict first.")
+                raise CannotExecute("There is no new prediction to execute; drag the pusher first.")
             self._executing, self._message = prediction, _EXECUTING
         message = ""
         try:
@@ -206,11 +237,9 @@ class PushPanel(Panel):
 
     def _draw_plan(self, record: SceneRecord | None, *, is_executed: bool) -> None:
         path = None
-        if record is not None:
-            self._controls.follow(record, is_chosen=self._has_plan)
-            path = self._controls.path(record.state) if self._has_plan else None
-        self._controls.show_waypoints(path is not None)
-        self._nodes.plan(None if is_executed else path)  # once executed, the plan would only lead on from there
+        if record is not None and record.state.pusher is not None and self._target is not None and not is_executed:
+            path = np.stack([record.state.pusher[:2], self._target])
+        self._nodes.plan(path)  # once executed, it would only lead on from there
 
     def _draw_prediction(self, prediction: PushPrediction) -> str:
         """Draw a prediction, or what came of it; returns the status message."""
@@ -233,104 +262,6 @@ class PushPanel(Panel):
             if self._prediction is prediction:  # else the next drawing says what is newer, with its nodes
                 self._message = message
         return message
-
-
-# Choosing a push: straight ahead, or along waypoints that are dragged over the table
-
-STRAIGHT, PATH = "Straight", "Waypoints"
-COMPASS = {"→": 0, "↗": 45, "↑": 90, "↖": 135, "←": 180, "↙": 225, "↓": 270, "↘": 315}
-_SPEED = (0.05, MAX_SPEED_M_S)
-_DEFAULT_STEPS = 6
-_FURTHER_M = 0.05
-
-
-class PushControls:
-    """Elements for the kind of push, its heading, speed and length, and the waypoints.
-
-    Args:
-        server: whose open folder gets the elements, and whose scene gets the waypoints.
-        on_change: called when somebody has chosen another push; must be quick.
-    """
-
-    def __init__(self, server: viser.ViserServer, on_change: Callable[[], None]) -> None:
-        gui = server.gui
-        self._on_change = on_change
-        self._waypoints = Waypoints(server, on_change)
-        self._laid_for: tuple[str, tuple[float, ...]] = "", ()  # scene and pusher position
-        self._kind = gui.add_dropdown("Push", (STRAIGHT, PATH), hint="Straight ahead, or along handles to drag.")
-        self._compass = gui.add_button_group("Direction", tuple(COMPASS), hint="As seen from above, +y up.")
-        self._heading = gui.add_slider("Heading, °", 0, 355, 5, 0, hint="From +x toward +y.")
-        self._speed = gui.add_slider("Speed, m/s", *_SPEED, 0.01, 0.25)
-        self._steps = gui.add_slider("Steps", 1, MAX_ACTIONS, 1, _DEFAULT_STEPS, hint=f"Of {STEP_S} s each.")
-        self._count = gui.add_slider("Waypoints", FEWEST, MOST, 1, 3, visible=False)
-        for control in (self._heading, self._speed, self._steps, self._count):
-            control.on_update(lambda event: None if event.client is None else on_change())
-        self._kind.on_update(lambda _: self._choose_kind())
-        self._compass.on_click(lambda event: self._turn(event.target.value))
-
-    def actions(self, state: SceneState) -> Float[np.ndarray, "T 3"]:
-        """The chosen actions [m/s] from a state; values from browsers are clipped to the sliders' ranges.
-
-        Raises:
-            InvalidInput: if a path is empty or takes too many actions.
-        """
-        start = np.zeros(2) if state.pusher is None else state.pusher[:2]
-        speed_m_s = number_between(self._speed.value, *_SPEED)
-        if self._is_path:
-            return along(start, self._waypoints.places(self._waypoint_count), speed_m_s)
-        heading_rad = math.radians(number_between(self._heading.value, 0.0, 360.0))
-        return straight(heading_rad, speed_m_s, int(number_between(self._steps.value, 1, MAX_ACTIONS)))
-
-    def path(self, state: SceneState) -> Float[np.ndarray, "P 2"] | None:
-        """The chosen way of the pusher on the table [m], its start included; None without a pusher."""
-        if state.pusher is None:
-            return None
-        if self._is_path:  # straight through the handles, even where that takes too many actions
-            return np.concatenate([state.pusher[None, :2], self._waypoints.places(self._waypoint_count)])
-        return way(state.pusher[:2], self.actions(state))
-
-    def follow(self, record: SceneRecord, *, is_chosen: bool) -> None:
-        """Lay the waypoints out anew when the pusher has moved, and propose a push unless one was chosen here."""
-        if record.state.pusher is None:
-            return
-        pusher = record.state.pusher[:2]
-        laid_for = (record.id, tuple(pusher))
-        if laid_for != self._laid_for:
-            if self._laid_for[0] != record.id or not is_chosen:
-                self._aim(record.state)
-            self._waypoints.lay(pusher, toward_nearest(record.state)[0])
-            self._laid_for = laid_for
-
-    def show_waypoints(self, is_on: bool) -> None:
-        """Show the handles, if the push is a path, or hide them."""
-        self._waypoints.show(self._waypoint_count if is_on and self._is_path else 0)
-
-    @property
-    def _is_path(self) -> bool:
-        return self._kind.value == PATH
-
-    @property
-    def _waypoint_count(self) -> int:
-        return int(number_between(self._count.value, FEWEST, MOST))
-
-    def _choose_kind(self) -> None:
-        is_path = self._is_path
-        for control in (self._compass, self._heading, self._steps):
-            control.visible = not is_path
-        self._count.visible = is_path
-        self._on_change()
-
-    def _turn(self, arrow: str) -> None:
-        if arrow in COMPASS:  # clients may send anything
-            self._heading.value = COMPASS[arrow]
-            self._on_change()
-
-    def _aim(self, state: SceneState) -> None:
-        """Propose a push that reaches the nearest object and goes on for a few centimetres."""
-        heading_rad, distance_m = toward_nearest(state)
-        self._heading.value = int(5 * round(math.degrees(heading_rad) / 5)) % 360
-        step_m = STEP_S * number_between(self._speed.value, *_SPEED)
-        self._steps.value = min(max(math.ceil((distance_m + _FURTHER_M) / step_m - 1e-9), 1), MAX_ACTIONS)
 
 
 def number_between(value: object, low: float, high: float) -> float:

@@ -140,7 +140,9 @@ class Viewer:
         estimate = EstimatePanel(server, table, EstimateNodes(server, library, table.names))
         self._goal_panel = GoalPanel(server, library, self._goals, self._commands, self._run_command)
         episode = EpisodePanel(server, table, EpisodeNodes(server, library, table.names), estimate.forget)
-        push = PushPanel(server, library, self._predictions, self._runner.scenes.act, self._run_command)
+        push = PushPanel(
+            server, library, table.pusher, self._predictions, self._commands, self._runner.scenes.act, self._run_command
+        )
         return self.pages.neural, self.pages, estimate, self._goal_panel, episode, push
 
     def _add_client(self, client: viser.ClientHandle) -> None:

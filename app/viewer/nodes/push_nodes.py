@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import viser
@@ -25,7 +25,6 @@ from app.viewer.nodes.room import NO_LINES, atomic
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import PUSHER_REACH_M
 from osfcore.objects.asset_library import AssetLibrary
 
 TRAIL = 5  # pale ghosts between start and end
@@ -113,53 +112,3 @@ def _draw(node: viser.LineSegmentsHandle, lines: Sequence[np.ndarray]) -> None:
     if lines:
         node.points = segments(lines)
     node.visible = bool(lines)
-
-
-# Waypoints
-
-FEWEST, MOST = 2, 5
-SPACING_M = 0.07
-_HANDLE_Z_M = 0.01
-
-
-class Waypoints:
-    """Up to five handles, made once and shown on demand.
-
-    Args:
-        server: to draw in.
-        on_drag: called on viser's loop when one was moved by hand; must be quick.
-    """
-
-    def __init__(self, server: viser.ViserServer, on_drag: Callable[[], None]) -> None:
-        self._handles = [self._add_handle(server.scene, number, on_drag) for number in range(MOST)]
-
-    @staticmethod
-    def _add_handle(scene: viser.SceneApi, number: int, on_drag: Callable[[], None]) -> viser.TransformControlsHandle:
-        path = f"/push/waypoints/{number}"
-        handle = scene.add_transform_controls(
-            path, scale=0.07, active_axes=(True, True, False), disable_rotations=True, depth_test=False, visible=False
-        )
-        scene.add_icosphere(f"{path}/ball", 0.008, PREDICTED, cast_shadow=False, receive_shadow=False)
-        scene.add_label(f"{path}/number", str(number + 1), font_screen_scale=0.8, anchor="bottom-center")
-
-        async def drag(_: viser.TransformControlsEvent) -> None:
-            on_drag()
-
-        handle.on_update(drag)
-        return handle
-
-    def show(self, count: int) -> None:
-        """Show the first few handles; 0 hides all."""
-        for number, handle in enumerate(self._handles):
-            handle.visible = number < count
-
-    def lay(self, start: Float[np.ndarray, "2"], heading_rad: float) -> None:
-        """Put them in a row that begins at the pusher [m], within its reach."""
-        step = SPACING_M * np.array([np.cos(heading_rad), np.sin(heading_rad)])
-        for number, handle in enumerate(self._handles, 1):
-            x, y = np.clip(start + number * step, -PUSHER_REACH_M, PUSHER_REACH_M)
-            handle.position = (float(x), float(y), _HANDLE_Z_M)
-
-    def places(self, count: int) -> Float[np.ndarray, "P 2"]:
-        """Where the first few are [m]."""
-        return np.array([handle.position[:2] for handle in self._handles[:count]], float)

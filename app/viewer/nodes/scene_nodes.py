@@ -61,6 +61,9 @@ class SceneNodes:
         on_light: called on viser's loop with light and client when the light was let go; None likewise.
         cameras: that are drawn.
         root: below which everything but the lamp is drawn.
+
+    Attributes:
+        pusher: its node.
     """
 
     def __init__(
@@ -90,7 +93,7 @@ class SceneNodes:
         self._has_gizmos = self._is_grabbable = False
         self._light_requests: dict[str, tuple[bool, str]] = {}  # whether it is visible, and the text beside it
         self._shadows = ShadowNodes(self._scene, library, f"{root}/shadows")
-        self._pusher = self._scene.add_cylinder(
+        self.pusher = self._scene.add_cylinder(
             f"{root}/pusher",
             radius=PUSHER_RADIUS_M,
             height=PUSHER_HEIGHT_M,
@@ -118,7 +121,7 @@ class SceneNodes:
                     self._add_object(name)
             self._grabbed.clear()
             self._is_light_held = False
-            self._pusher.visible = state is not None
+            self.pusher.visible = state is not None
             self._show_light()
             for frustum in self._frustums.values():
                 frustum.image = None
@@ -137,7 +140,7 @@ class SceneNodes:
             names = tuple(self._bodies)
             positions = np.array([self._bodies[name].position for name in names], float).reshape(-1, 3)
             quaternions = np.array([self._bodies[name].wxyz for name in names], float).reshape(-1, 4)
-            pusher = np.array(self._pusher.position, float) if self._pusher.visible else None
+            pusher = np.array(self.pusher.position, float) if self.pusher.visible else None
             return SceneState(names, Pose(positions, quaternions), Light(np.array(self._lamp.position)), pusher)
 
     def place(self, state: SceneState) -> None:
@@ -151,7 +154,7 @@ class SceneNodes:
                         put(self._gizmos[name], pose.position, NO_TURN)
             self._place_labels()
             if state.pusher is not None:
-                put(self._pusher, state.pusher)
+                put(self.pusher, state.pusher)
             if not self._is_light_held:
                 self._place_light(state.light.position)
                 if self._light_gizmo is not None:
@@ -362,7 +365,7 @@ class SceneNodes:
         if self._light_gizmo is not None:
             self._light_gizmo.visible = is_on
         colour = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR
-        self._marker.show(is_on=is_on, has_ray=self._pusher.visible, text=name, colour=colour)
+        self._marker.show(is_on=is_on, has_ray=self.pusher.visible, text=name, colour=colour)
 
 
 def level_point(

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.services.pushes import MAX_ACTIONS, along, outcomes, straight, toward_nearest, way
+from app.services.pushes import beyond_nearest, outcomes, toward
 from osfcore.errors import InvalidInput
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -23,54 +23,36 @@ def state(positions, quaternions=None, pusher=(0.1, 0.2)):
     return SceneState((BOX, CAN)[:count], poses, Light(np.array([0, 0, 1.0])), hand)
 
 
-@given(st.floats(0, 7), st.floats(0.05, 0.3), st.integers(1, MAX_ACTIONS))
-def test_straight_goes_as_far_as_speed_and_time_tell(heading, speed, count):
-    actions = check_actions(straight(heading, speed, count)[None])[0]
-    assert actions.shape == (count, 3)
-    assert np.linalg.norm(STEP_S * actions.sum(axis=0)) == pytest.approx(speed * count * STEP_S)
-
-
-@given(st.lists(st.tuples(place, place), min_size=1, max_size=3), st.floats(0.2, 0.3))
-def test_along_passes_every_waypoint_within_limits(waypoints, speed):
+@given(st.tuples(place, place), st.floats(0.05, 0.3))
+def test_a_push_ends_at_its_target_within_limits(target, speed):
     start = np.array([0.3, 0.3])
     try:
-        actions = along(start, np.array(waypoints), speed)
+        actions = toward(start, np.array(target), speed)
     except InvalidInput:
         return
     check_actions(actions[None])
     assert np.linalg.norm(actions, axis=1).max() <= speed + 1e-9
-    places = way(start, actions)
-    for waypoint in np.clip(waypoints, -PUSHER_REACH_M, PUSHER_REACH_M):
-        assert np.linalg.norm(places - waypoint, axis=1).min() < 1e-6
+    end = start + STEP_S * actions[:, :2].sum(axis=0)
+    np.testing.assert_allclose(end, np.clip(target, -PUSHER_REACH_M, PUSHER_REACH_M), atol=1e-9)
 
 
 def test_a_fast_diagonal_keeps_to_the_limit_of_each_axis():
-    actions = along(np.zeros(2), np.array([[0.12, 0.0]]), 1.0)
+    actions = toward(np.zeros(2), np.array([0.12, 0.0]), 1.0)
     np.testing.assert_allclose(actions, [[0.3, 0, 0], [0.3, 0, 0]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("waypoints", "words"),
-    [
-        ([[0.0, 0.0]], "number of actions on this path is 0"),
-        ([[0.3, 0], [-0.3, 0]] * 4, "50"),
-        ([[np.nan, 0]], "finite"),
-    ],
+    ("target", "speed", "words"), [([0.0, 0.0], 0.1, "is 0"), ([0.3, 0.3], 0.01, "50"), ([np.nan, 0], 0.1, "finite")]
 )
-def test_paths_that_lead_nowhere_or_too_far_are_refused(waypoints, words):
+def test_pushes_that_lead_nowhere_or_take_too_long_are_refused(target, speed, words):
     with pytest.raises(InvalidInput, match=words):
-        along(np.zeros(2), np.array(waypoints), 0.1)
+        toward(np.zeros(2), np.array(target), speed)
 
 
-def test_the_way_ends_where_the_reach_does():
-    np.testing.assert_allclose(way(np.array([0.3, 0]), straight(0, 0.3, 3))[:, 0], [0.3, 0.35, 0.35, 0.35], atol=1e-12)
-
-
-def test_toward_the_nearest():
-    heading, far = toward_nearest(state([[0.1, 0.1, 0.1], [-0.2, 0.2, 0.1]]))
-    assert np.rad2deg(heading) == pytest.approx(-90)
-    assert far == pytest.approx(0.1)
-    assert toward_nearest(state([])) == toward_nearest(state([[0, 0, 0]], pusher=None)) == (0.0, 0.0)
+def test_the_nearest_object_is_pushed_a_little_beyond_its_place():
+    target = beyond_nearest(state([[0.1, 0.1, 0.1], [-0.2, 0.2, 0.1]]))
+    assert target == pytest.approx([0.1, 0.05])
+    assert beyond_nearest(state([])) is beyond_nearest(state([[0, 0, 0]], pusher=None)) is None
 
 
 def test_outcomes_tell_ways_and_errors(library):

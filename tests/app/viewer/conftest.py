@@ -95,9 +95,10 @@ class ViewerDriver:
     def drag_body(self, path, eye, grip, to):
         """Take hold of a node itself where it is seen from an eye, and let it go elsewhere."""
         camera = SimpleNamespace(camera=SimpleNamespace(position=eye), add_notification=lambda *_, **__: None)
+        node = self.node(path)
         for phase, end in (("start", grip), ("update", to), ("end", to)):
-            event = SimpleNamespace(client=camera, phase=phase, start_position=grip, end_position=end)
-            for entry in self.node(path)._impl.drag_cb:
+            event = SimpleNamespace(client=camera, target=node, phase=phase, start_position=grip, end_position=end)
+            for entry in node._impl.drag_cb:
                 asyncio.run(entry.callback(event))
 
     def is_draggable(self, path):

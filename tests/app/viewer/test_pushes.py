@@ -1,6 +1,6 @@
 """Predicted pushes in the 3D view: what is drawn, what is chosen, and what came of them."""
 
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,20 +14,21 @@ from app.services.event_hub import CurrentScene, Notice
 from app.services.fields import MissingFields
 from app.services.pushes import MAX_ACTIONS, Outcome
 from app.services.scenes import SceneHeld
-from app.viewer.nodes.push_nodes import MOST, SPACING_M, TRAIL, PushNodes, Waypoints
-from app.viewer.push_panel import PATH, PushPanel, PushPrediction, report
+from app.viewer.nodes.push_nodes import TRAIL, PushNodes
+from app.viewer.push_panel import PushPanel, PushPrediction, report
 from osfcore.errors import OsfError
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
-from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, PUSHER_REACH_M
+from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from tests.app.conftest import until
 from tests.app.storage.test_database import record
 from tests.app.viewer.conftest import ViewerDriver
 
 BOX, CAN, GONE = "003_cracker_box", "005_tomato_soup_can", "my_thing"
 COUNT = 11
+PREDICT = "Predict toward the nearest"
 
 
 @pytest.fixture
@@ -111,24 +112,6 @@ def test_truth_is_drawn_beside_it_and_all_goes_again(drawing, driver, rollouts):
     drawing.at(3)  # there is nothing to move
 
 
-def test_handles_are_laid_shown_and_dragged(server, driver):
-    dragged = []
-
-    def visible():
-        return [number for number in range(MOST) if driver.shows(f"/push/waypoints/{number}")]
-
-    waypoints = Waypoints(server, lambda: dragged.append(True))
-    waypoints.lay(np.array([0.3, 0.0]), np.pi / 2)
-    np.testing.assert_allclose(waypoints.places(2), [[0.3, SPACING_M], [0.3, 2 * SPACING_M]], atol=1e-9)
-    waypoints.lay(np.array([0.3, 0.0]), 0.0)
-    assert waypoints.places(MOST).max() == PUSHER_REACH_M
-    assert visible() == []
-    waypoints.show(3)
-    assert visible() == [0, 1, 2]
-    driver.drag("/push/waypoints/0", None, None, "update")
-    assert dragged == [True]
-
-
 NOTHING = Rollouts(("x", "y"), np.zeros((1, 3, 2, 3)), np.zeros((1, 3, 2, 4)), np.zeros((1, 3, 3)))
 
 
@@ -201,7 +184,9 @@ class Room:
     def __init__(self, server, library):
         self.asked, self.acted, self.refused = [], [], []
         self.record, self.refusal, self.jumps_in, self.is_warm = RECORD, None, False, True
-        self.panel = PushPanel(server, library, self, self.act, self.run)
+        pusher = server.scene.add_cylinder("/pusher", position=RECORD.state.pusher)
+        self.commands = ThreadPoolExecutor(1)
+        self.panel = PushPanel(server, library, pusher, self, self.commands, self.act, self.run)
         self.gui = ViewerDriver(server, SOMEBODY)
 
     def current(self):
@@ -237,8 +222,13 @@ class Room:
         asked = self.asked[number]
         asked.answer.set_result(Predicted(rollouts_of(asked.actions[0], goes_m), 0.02))
 
+    def drag(self, to):
+        """Drag the pusher, which is seen from above, to a place on the table."""
+        at = RECORD.state.pusher
+        self.gui.drag_body("/pusher", np.array([*at[:2], 1.0]), at, np.array([*to, at[2]]))
+
     def predict(self, goes_m=0.04):
-        self.gui.press("Predict")
+        self.gui.press(PREDICT)
         self.answer(goes_m)
         self.gui.says("predicted in")
 
@@ -261,20 +251,16 @@ def room(server, library):
     room.panel.close()
 
 
-def test_it_begins_with_a_push_that_reaches_the_nearest_object_and_draws_nothing(room):
-    assert room.gui.element("Heading, °").value == 0
-    assert room.gui.element("Steps").value == 3  # 10 cm, and 5 more
+def test_nothing_is_drawn_or_pushed_before_a_push_is_chosen(room):
     assert not room.gui.shows("/push/plan")
-    assert room.gui.element("Execute").disabled
+    assert room.gui.element("Push").disabled
 
 
-def test_from_a_direction_to_ghosts_and_from_there_to_the_error(room):
-    room.gui.press("Direction", "↑")
-    until(lambda: room.gui.element("Heading, °").value == 90)
-    until(lambda: room.gui.shows("/push/plan"))
+def test_from_a_drag_to_ghosts_and_from_there_to_the_error(room):
     room.is_warm = False
-    room.gui.press("Predict")
+    room.drag((-0.1, 0.15))
     room.gui.says("Loading the network")
+    until(lambda: room.gui.shows("/push/plan"))
     (asked,) = room.asked
     np.testing.assert_allclose(asked.actions, np.tile([0, 0.25, 0], (1, 3, 1)), atol=1e-9)
     assert asked.state is RECORD.state
@@ -282,8 +268,8 @@ def test_from_a_direction_to_ghosts_and_from_there_to_the_error(room):
     room.gui.says("1 object will move; predicted in 20 ms")
     assert room.moving() == {BOX}
     assert "40 mm" in room.gui.text()
-    until(lambda: not room.gui.element("Execute").disabled)
-    room.gui.press("Execute")
+    until(lambda: not room.gui.element("Push").disabled)
+    room.gui.press("Push")
     room.gui.says("Executed")
     ((scene, actions),) = room.acted
     assert scene == "s"
@@ -292,22 +278,15 @@ def test_from_a_direction_to_ghosts_and_from_there_to_the_error(room):
     assert "<b>10 mm<br>0.0°</b>" in room.gui.text()
     assert room.moving() == {BOX}  # the ghosts stay
     assert room.gui.shows("/push/true_ways")
-    until(lambda: room.gui.element("Execute").disabled)
+    until(lambda: room.gui.element("Push").disabled)
     room.gui.press("Clear")
     until(lambda: room.moving() == set())
     assert "push-report" not in room.gui.text()
 
 
-def test_waypoints_become_actions(room):
-    room.gui.set("Push", PATH)
-    until(lambda: room.gui.shows("/push/waypoints/2"))
-    assert not room.gui.element("Heading, °").visible
-    for number, place in enumerate([(-0.1, 0.05, 0), (0.0, 0.05, 0)]):
-        room.gui.node(f"/push/waypoints/{number}").position = place
-    room.gui.set("Waypoints", 2)
-    until(lambda: not room.gui.shows("/push/waypoints/2"))
-    room.gui.press("Predict")
-    np.testing.assert_allclose(room.asked[0].actions, [[[0, 0.25, 0], [0.25, 0, 0], [0.25, 0, 0]]], atol=1e-9)
+def test_without_a_hand_the_nearest_object_is_pushed(room):
+    room.gui.press(PREDICT)
+    np.testing.assert_allclose(room.asked[0].actions, np.tile([0.25, 0, 0], (1, 3, 1)), atol=1e-9)  # 10 cm, and 5 more
 
 
 def test_time_is_sought_and_played(room):
@@ -329,7 +308,7 @@ def test_a_prediction_is_dropped_when_the_table_changes_or_another_push_is_chose
     room.change()
     room.gui.says("has changed")
     until(lambda: room.moving() == set())
-    room.gui.press("Predict")
+    room.gui.press(PREDICT)
     room.change()
     room.answer()
     room.gui.says("has changed")
@@ -346,7 +325,7 @@ def test_a_prediction_is_dropped_when_the_table_changes_or_another_push_is_chose
 
 def test_after_the_comparison_another_change_ends_it(room):
     room.predict()
-    room.gui.press("Execute")
+    room.gui.press("Push")
     room.gui.says("Executed")
     room.change()
     room.gui.says("has changed")
@@ -356,7 +335,7 @@ def test_after_the_comparison_another_change_ends_it(room):
 def test_what_somebody_else_does_at_the_same_time_is_not_taken_for_the_push(room):
     room.predict()
     room.jumps_in = True
-    room.gui.press("Execute")
+    room.gui.press("Push")
     room.gui.says("has changed")
     assert not room.gui.shows("/push/true_ways")
 
@@ -365,14 +344,14 @@ def test_what_somebody_else_does_at_the_same_time_is_not_taken_for_the_push(room
 def test_refusals_are_told_to_who_asked_and_in_the_panel(room, refusal):
     room.predict()
     room.refusal = refusal
-    room.gui.press("Execute" if isinstance(refusal, SceneHeld) else "Predict")
+    room.gui.press("Push" if isinstance(refusal, SceneHeld) else PREDICT)
     assert room.refused == [(str(refusal), SOMEBODY)]
     room.gui.says(str(refusal)[:30])
 
 
 def test_an_answer_may_be_a_refusal_or_overtaken(room):
-    room.gui.press("Predict")
-    room.gui.press("Predict")
+    room.gui.press(PREDICT)
+    room.gui.press(PREDICT)
     assert {asked.key for asked in room.asked} == {"viewer"}
     room.asked[0].answer.set_result(None)
     room.asked[1].answer.set_exception(ProcessUnavailable("predictor", "stopped unexpectedly"))
@@ -381,22 +360,20 @@ def test_an_answer_may_be_a_refusal_or_overtaken(room):
 
 
 def test_executing_needs_a_new_prediction(room):
-    room.gui.press("Execute")
-    assert "Predict first" in room.refused.pop()[0]
+    room.gui.press("Push")
+    assert "drag the pusher first" in room.refused.pop()[0]
     room.predict()
-    room.gui.press("Execute")
+    room.gui.press("Push")
     assert room.refused == []
-    room.gui.press("Execute")
-    assert "Predict first" in room.refused.pop()[0]
+    room.gui.press("Push")
+    assert "drag the pusher first" in room.refused.pop()[0]
     assert len(room.acted) == 1
 
 
 @pytest.mark.parametrize("nonsense", [float("nan"), 1e12, -1e12])
-def test_numbers_beyond_the_sliders_do_no_harm(room, nonsense):
-    for label in ("Heading, °", "Speed, m/s", "Steps", "Waypoints"):
-        room.gui.set(label, nonsense)
-    room.gui.press("Direction", "sideways")
-    room.gui.press("Predict")
+def test_numbers_beyond_the_slider_do_no_harm(room, nonsense):
+    room.gui.set("Speed, m/s", nonsense)
+    room.gui.press(PREDICT)
     assert 1 <= room.asked[0].actions.shape[1] <= MAX_ACTIONS
     room.answer()
     room.gui.says("predicted in")
@@ -407,7 +384,7 @@ def test_numbers_beyond_the_sliders_do_no_harm(room, nonsense):
 def test_a_defect_in_drawing_does_not_end_the_view(room, monkeypatch):
     with monkeypatch.context() as broken:
         broken.setattr(PushNodes, "show", lambda *_: 1 / 0)
-        room.gui.press("Predict")
+        room.gui.press(PREDICT)
         room.answer()
         until(lambda: room.panel.is_idle)
     room.predict()
