@@ -26,7 +26,7 @@ from app.viewer.drawing import Panel
 from app.viewer.neural_panel import NeuralPanel
 from app.viewer.nodes.episode_nodes import EpisodeNodes, add_copy
 from app.viewer.nodes.estimate_nodes import TRACKED
-from app.viewer.nodes.room import atomic, framing
+from app.viewer.nodes.room import VIEW_FOV_RAD, atomic, framing
 from app.viewer.nodes.scene_nodes import LAMP, LIVE_NODES, SceneNodes, extent_m
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose
@@ -123,8 +123,8 @@ class _View:
 
     def frame(self, points_m: Float[np.ndarray, "N 3"]) -> None:
         """Let the camera stand where points fill the view [m]."""
-        camera = self.client.camera
-        camera.position, camera.look_at = framing(points_m, camera.fov, camera.aspect)
+        camera = self.client.camera  # which may not know its field of view yet
+        camera.position, camera.look_at = framing(points_m, VIEW_FOV_RAD, camera.aspect)
 
     def close(self) -> None:
         """Show the live table again."""

@@ -76,16 +76,21 @@ def table_colour(page):
     return np.median(image[int(0.78 * height) : int(0.82 * height), int(0.3 * width) : int(0.4 * width)], axis=(0, 1))
 
 
-def pusher_centre(image, scene, library):
-    """Where the pusher is in a picture of the 3D view, by its colour [px]."""
-    height, width, _ = image.shape
+def seen_at(point_m, scene, library, width, height):
+    """Where a point of the world is in the 3D view of a table that was framed [px]."""
     things = scene["objects"]
     poses = Pose(np.array([one["position"] for one in things]), np.array([one["quaternion"] for one in things]))
     light, pusher = Light(np.array(scene["light"]["position"])), np.array(scene["pusher"]["position"])
     seen = extent_m(SceneState(tuple(one["name"] for one in things), poses, light, pusher), library)
     position, look_at = framing(seen, VIEW_FOV_RAD, width / height)
     view = Camera.look_at("view", position, look_at, size=height, fov_y_deg=np.rad2deg(VIEW_FOV_RAD))
-    at = view.project(np.array(scene["pusher"]["position"])) + [(width - height) / 2, 0]
+    return view.project(np.array(point_m)) + [(width - height) / 2, 0]
+
+
+def pusher_centre(image, scene, library):
+    """Where the pusher is in a picture of the 3D view, by its colour [px]."""
+    height, width, _ = image.shape
+    at = seen_at(scene["pusher"]["position"], scene, library, width, height)
     left, top = np.round(at).astype(int) - WINDOW_PX
     window = image[top : top + 2 * WINDOW_PX, left : left + 2 * WINDOW_PX]
     red, green, blue = np.moveaxis(window, -1, 0)
