@@ -91,7 +91,7 @@ export function showEpisode(episode, step) {
 function sourceOf({ id, name, status, steps, step_s: times }) {
   return {
     of: { episode: id }, name, isRunning: LIVE.has(status),
-    times: times.length < steps.length ? steps.map((_, i) => STEP_S * i) : times.slice(0, steps.length),
+    times: times.length < steps.length ? steps.map((_, i) => STEP_S * i) : times,
     actions: steps.map(({ step }) => step),
     draw: drawStep,
     left: closeShown,

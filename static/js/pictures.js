@@ -12,7 +12,7 @@ const PARTS = [
 ];
 const CAMERAS = [0, 1, 2, 3].map((camera) => ({ part: `camera-${camera}`, label: `Camera ${camera}`, row: 1, column: camera }));
 const all = []; // every image that shows a part of the frame
-const alone = []; // { part, image }: what stands in before there is a frame
+const alone = new Map(); // part -> image that stands in before there is a frame
 
 const frame = new LatestImage({
   set src(url) {
@@ -26,19 +26,12 @@ const frame = new LatestImage({
 });
 
 /** A window onto one tile of the frame. */
-function crop({ part, label, row, column }, standsIn = false) {
+function crop({ label, row, column }) {
   const image = el("img", { alt: label, className: "part-of-frame" });
   image.style.left = `${-100 * column}%`;
   image.style.top = `${-100 * ((16 + 208 * row) / 192)}%`; // a caption of 16 px is above each tile of 192
   all.push(image);
-  const window = el("span", { className: "crop" }, image);
-  if (standsIn) {
-    const stand = el("img", { alt: "", className: "stand-in", hidden: true });
-    stand.addEventListener("error", () => { stand.hidden = true; });
-    alone.push({ part, image: stand });
-    window.append(stand);
-  }
-  return window;
+  return el("span", { className: "crop" }, image);
 }
 
 export function showFrame(url) {
@@ -51,10 +44,10 @@ export function preload(url) {
 }
 
 /** Before the first frame: the goal image and what the goal camera sees. */
-export function standIn(urls) {
+export function standIn({ goal, now }) {
   frame.clear();
-  for (const { part, image } of alone) {
-    const url = urls[part];
+  for (const [part, url] of Object.entries({ goal, now })) {
+    const image = alone.get(part);
     image.hidden = !url;
     if (url) image.src = url;
     else image.removeAttribute("src");
@@ -70,14 +63,19 @@ function showMode(mode) {
 export function setUpPictures() {
   for (const [set, parts] of Object.entries({ four: PARTS, cameras: CAMERAS })) {
     for (const part of parts) {
-      const figure = el("figure", {}, crop(part, set === "four"), el("figcaption", { textContent: part.label }));
+      const figure = el("figure", {}, crop(part), el("figcaption", { textContent: part.label }));
       Object.assign(figure.dataset, { set, part: part.part });
       byId("tiles").append(figure);
     }
   }
-  for (const part of PARTS.slice(0, 2)) byId(`pinned-${part.part}`).prepend(crop(part, true));
+  for (const part of PARTS.slice(0, 2)) {
+    const stand = el("img", { alt: "", className: "stand-in", hidden: true });
+    stand.addEventListener("error", () => { stand.hidden = true; });
+    alone.set(part.part, stand);
+    byId(`pinned-${part.part}`).prepend(crop(part), stand);
+  }
   for (const [i, tile] of [...byId("camera-strip").children].entries()) tile.prepend(crop([...CAMERAS, PARTS[0]][i]));
-  const [goal, now] = PARTS.map((part) => crop(part));
+  const [goal, now] = PARTS.slice(0, 2).map(crop);
   now.classList.add("over");
   byId("wipe-pair").append(goal, now);
   const wipe = () => { now.style.clipPath = `inset(0 ${byId("wipe-at").value}% 0 0)`; };

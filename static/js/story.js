@@ -86,16 +86,14 @@ async function play() {
     draw, ended, left: closeStory,
   };
   timeline.show(source, 0);
-  const isUntouched = () => timeline.source === source && timeline.at === 0 && !timeline.isPlaying;
-  for (const until = performance.now() + PATIENCE_MS; isUntouched() && !isStill.matches; ) {
-    if (performance.now() > until || (await isViewOpen())) return isUntouched() && timeline.play();
-    await new Promise((resolve) => setTimeout(resolve, WAIT_MS));
-  }
-  return undefined;
+  const mayBegin = () => timeline.source === source && timeline.at === 0 && !timeline.isPlaying && !isStill.matches;
+  const until = performance.now() + PATIENCE_MS;
+  while (mayBegin() && performance.now() < until && !(await isViewOpen())) await new Promise((resolve) => setTimeout(resolve, WAIT_MS));
+  if (mayBegin()) timeline.play();
 }
 
 function ended() {
-  if (number + 1 >= ROUNDS * stories.length || document.hidden) return;
+  if (number + 1 >= ROUNDS * stories.length || document.hidden || isStill.matches) return;
   resting = setTimeout(() => {
     number += 1;
     play();
@@ -116,7 +114,7 @@ function open() {
 }
 
 /** Ends the story; the live table is on view again. */
-export function closeStory() {
+function closeStory() {
   if (!isOn) return;
   isOn = false;
   clearTimeout(resting);

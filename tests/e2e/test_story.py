@@ -37,7 +37,7 @@ def page(browser, service):
     page = context.new_page()
     page.problems = []
     watch_errors(page)
-    page.on("console", lambda m: page.problems.append(m.text) if m.type == "error" else None)
+    page.on("console", lambda m: page.problems.append((m.text, m.location)) if m.type == "error" else None)
     page.goto(service.url)
     yield page
     assert page.problems == []
