@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
@@ -68,19 +70,26 @@ def _note_of(event: Looking) -> str:
 # How far an episode is and how long it will take, over all of looking, planning and pushing.
 
 
-# On two cores, where nothing is known yet: medians of the episodes that the shipped stories were chosen from.
+# On two cores, where nothing is known yet. Looks: medians of the episodes that the shipped stories were chosen from;
+# pushes: about what those stories took.
 _LOOK_S = {"first": 30.0, "goal": 25.0}
-_ROUND_S = 4.0
-_PUSHES = 20
-_FEW = 3  # pushes from which nobody knows how many it takes
+_ROUND_S = 1.0
+_PUSHES = 30
+_SURE = 10  # pushes from which their own rate of approach counts more than the usual one
+_RECENT = 8  # pushes whose mean time is that of those to come
+_LAST_SHARE = 0.1  # of the pushes so far that are still to come, at least, where more have come than usual
+_CALM_S = 6.0  # in which most of a change is told
 
 
 class TimeLeft:
     """The share of an episode that is over, from its events.
 
-    A look takes a usual time, or what its steps so far predict, by the share that is over; pushing goes on until
-    the sum of the offsets from the goal is gone at the mean rate so far, or to the last push where offsets are not
-    known. A rest that ends with `go_on` does not count.
+    A look takes a usual time, or what its steps so far predict, by the share that is over. Pushes take the mean time of
+    the recent ones. How many are needed is the mean of two numbers: what is left of a usual episode, and what takes the
+    offsets from the goal away at the rate so far; all that are allowed where offsets are not known. The first pushes
+    only reach an object and the last ones move it by a hair, so that this changes much from one push to the next; it is
+    told by and by, and what is told never rises by more than the time that has passed. A rest that ends with `go_on`
+    does not count.
 
     Args:
         clock: returns the time [s].
@@ -95,6 +104,8 @@ class TimeLeft:
         self._first_off_m = self._off_m = 0.0
         self._is_blind = False  # offsets are not known
         self._pushes, self._share = 0, 0.0
+        self._pushed: deque[float] = deque(maxlen=_RECENT + 1)  # when the recent ones were over, on `_elapsed`
+        self._told: float | None = None  # for pushing, since the first plan [s]
 
     def go_on(self) -> None:
         """A rest is over."""
@@ -111,8 +122,8 @@ class TimeLeft:
             Share of the episode that is over, which never falls, and time left [s].
         """
         now = self._clock()
-        self._elapsed += now - self._now
-        self._now = now
+        passed = now - self._now
+        self._elapsed, self._now = self._elapsed + passed, now
         match event:
             case Looking(look=look) if look in _LOOK_S:
                 self._look(look, event)
@@ -120,12 +131,16 @@ class TimeLeft:
                 self._left.clear()
                 self._off_m, self._is_blind = float(event.offsets_m.sum()), event.offsets_m.size == 0
                 self._first_off_m = self._first_off_m or self._off_m
+                if self._told is None:
+                    self._pushed.append(self._elapsed)
+                    self._told = self._pushing(most)
             case ActionExecuted(number):
-                self._since.setdefault("push", self._elapsed)
+                self._pushed.append(self._elapsed)
                 self._pushes = number
             case _:
                 pass
-        left = 0.0 if isinstance(event, Finished) else sum(self._left.values()) + self._pushing(most)
+        pushing = self._calmly(self._pushing(most), passed)
+        left = 0.0 if isinstance(event, Finished) else sum(self._left.values()) + pushing
         self._share = max(self._share, self._elapsed / max(self._elapsed + left, 1e-9))
         return self._share, left
 
@@ -138,10 +153,25 @@ class TimeLeft:
 
     def _pushing(self, most: int) -> float:
         """Time for the pushes that are still needed [s]."""
-        gained = self._first_off_m - self._off_m
-        needed = most if self._is_blind else max(_PUSHES - self._pushes, 1.0)
-        if self._pushes > _FEW and gained > 0:
-            needed = self._off_m / (gained / self._pushes)
-        spent = self._elapsed - self._since.get("push", self._elapsed)
-        each = spent / (self._pushes - 1) if self._pushes > 1 else _ROUND_S
+        recent = self._pushed
+        each = (recent[-1] - recent[0]) / (len(recent) - 1) if len(recent) > 1 else _ROUND_S
+        usual = max(_PUSHES - self._pushes, _LAST_SHARE * self._pushes, 1.0)
+        if self._is_blind:
+            needed = float(most)
+        elif self._first_off_m == 0:
+            needed = usual
+        else:
+            mean_m = self._first_off_m / _PUSHES
+            gained = self._first_off_m - self._off_m + _SURE * mean_m
+            rate = max(gained / (self._pushes + _SURE), mean_m / 4)
+            needed = (usual + self._off_m / rate) / 2
         return min(needed, max(most - self._pushes, 0)) * each
+
+    def _calmly(self, left: float, passed: float) -> float:
+        """Return what is told of a time left [s]."""
+        if self._told is None:
+            return left
+        expected = self._told - passed
+        change = (left - expected) * (1 - math.exp(-passed / _CALM_S))
+        self._told = max(expected + min(change, 2 * passed), min(left, _ROUND_S))
+        return self._told

@@ -171,8 +171,9 @@ class EpisodeRecord:
             case Noticed():
                 self._notices.append({"step": event.number, "matter": event.matter, "text": event.text})
             case Stepped():
-                self._steps.append(self._step_entry(event))
+                entry = self._step_entry(event)
                 self._draw(event)
+                self._steps.append(entry)  # last: however it is broken off, no step is told of that has no frame
             case Finished():
                 self._end = event.outcome, event.text
             case _:
@@ -258,7 +259,7 @@ class EpisodeRecord:
         title = f"step {event.number} of {event.steps}"
         now = self._now(self._image.camera)
         picture = frame(self._image.image, now, event.rendered, self._seen.images, title, self._photo)
-        write_png(self._folder / FRAMES_FOLDER / f"{len(self._steps) - 1:03d}.png", picture)
+        write_png(self._folder / FRAMES_FOLDER / f"{len(self._steps):03d}.png", picture)
 
     def _now(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
         """Return what the goal's camera sees now: in a simulation, or as one of the robot's; else the first one's."""
@@ -302,7 +303,8 @@ class EpisodeRecord:
             "steps": self._steps,
         }
         if self._course is not None:
-            report["step_s"] = [round(at_s, 3) for at_s in ReplayClock(self._course.trajectory).step_s]
+            times = ReplayClock(self._course.trajectory).step_s[: len(self._steps)]
+            report["step_s"] = [round(at_s, 3) for at_s in times]
         if about.parts is not None:
             report["parts"] = about.parts.to_json()
         if about.goal is not None:

@@ -51,12 +51,12 @@ export class LatestImage {
   }
 }
 
-/** The goal camera's tile shows the goal, if one was chosen: what the table looks like from there is beside it all the time. */
-const showsGoal = (camera) => camera === "goal" && !showsMasks && Boolean(known("goal"));
+/** The goal camera's tile shows the goal, of a recording or else the chosen one: what the table looks like is beside it. */
+const showsGoal = (camera) => camera === "goal" && (known("recorded") || (!showsMasks && Boolean(known("goal"))));
 const labelOfTile = (name) => (name !== "goal" ? `Camera ${name}` : showsGoal(name) ? "Goal" : "Goal camera, now");
 
 function url(scene, camera, size, { pusher = true } = {}) {
-  if (showsGoal(camera)) return imageOf(known("goal"));
+  if (showsGoal(camera) && known("goal")) return imageOf(known("goal"));
   const query = new URLSearchParams({ size, masks: showsMasks, pusher, v: scene.revision });
   return `api/scenes/${scene.id}/images/${camera}.png?${query}`;
 }
@@ -120,6 +120,12 @@ export function setUpCameras() {
   }
   byId("camera-dialog").addEventListener("close", () => { largeCamera = null; });
   byId("masks").addEventListener("change", (event) => toggleMasks(event.target.checked));
+  watch("recorded", (on) => {
+    byId("cameras").classList.toggle("is-recorded", on);
+    byId("cameras-title").textContent = on ? "Cameras, recorded" : "Cameras";
+    for (const tile of byId("camera-strip").children) tile.disabled = on; // what they see now is not on view
+    refresh(current());
+  });
   let shown = null;
   watch("goal", () => refresh(current()));
   watch("scene", (scene) => {

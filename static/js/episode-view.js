@@ -11,21 +11,19 @@ import { drawResults } from "./results.js";
 import { NOT_KNOWN, offsets, roundAt } from "./run-summary.js";
 import { current, inWords, known, labelOf, set, watch } from "./state.js";
 import { scrollTo } from "./tabs.js";
-import { Timeline } from "./timeline.js";
+import { timeline } from "./timeline.js";
 import { tellFailure, toast } from "./toasts.js";
-import { replay, showLive } from "./viewer.js";
 
 let shown = null; // the episode, as fetched last
-let wanted = null; // {id, step} to be fetched next, a step by its actions; none: stay where one is, at the end if there
+let wanted = null; // {id, step} to be fetched next, a step by its actions; none: stay where one is
 let isFetching = false;
 let closings = 0;
-let timeline = null;
 let followed = ""; // the job that was put on view by itself
 let seen = ""; // how far the job was when it was fetched for
 let noting = 0;
-let isLive = true; // whether the 3D view is left on the live table
 
 const NOTE_MS = 300;
+const STEP_S = 0.6; // for episodes of earlier versions, which do not tell when a step is over
 const PREPARED = "What it found in table and photo was prepared with this example; from the first push on, all is live.";
 const PUBLISHED = "This is the method as published.";
 const OUTCOMES = { reached: "Reached", "out of steps": "Out of steps", refused: "Refused" };
@@ -68,29 +66,36 @@ export function openEpisode(id, step) {
 /** Puts a fetched episode on view, after so many actions or where one is. */
 export function showEpisode(episode, step) {
   const isOther = shown?.id !== episode.id;
-  const wasAtEnd = isOther || timeline.step >= timeline.last;
   shown = episode;
   set("report", episode);
   byId("shown").hidden = false;
   byId("shown").dataset.episode = episode.id;
   byId("shown").classList.toggle("before-steps", LIVE.has(episode.status) && !episode.steps.length);
   if (isOther) {
-    timeline.pause();
     note({ episode: episode.id, step: step ?? null });
     drawStandIn();
   }
   drawHead(episode);
-  const last = episode.steps.length - 1;
   const most = episode.steps.at(-1)?.step;
   if (Number.isFinite(step) && step > most) toast(`This episode has steps 0 to ${most}; showing the last one.`, "warning");
-  const at = Number.isFinite(step) ? roundAt(episode.steps, step) : wasAtEnd ? last : timeline.step;
-  timeline.set(last, at, episode.step_s, episode.steps.map(({ step: actions }) => actions));
+  const source = sourceOf(episode);
+  timeline.show(source, Number.isFinite(step) ? source.times[roundAt(episode.steps, step)] : undefined);
   drawEnding(episode);
   drawResults(episode, isOther);
-  if (isOther) show3D(LIVE.has(episode.status) && !Number.isFinite(step) ? null : { at_s: timeline.at(at), plays: false, speed: 1 });
   if (!isOther) return;
   if (LIVE.has(episode.status)) scrollTo(byId("shown"));
   else byId("shown").scrollIntoView({ block: "start" }); // somebody asked for it
+}
+
+/** What the timeline needs to know of an episode. */
+function sourceOf({ id, name, status, steps, step_s: times }) {
+  return {
+    of: { episode: id }, name, isRunning: LIVE.has(status),
+    times: times.length < steps.length ? steps.map((_, i) => STEP_S * i) : times,
+    actions: steps.map(({ step }) => step),
+    draw: drawStep,
+    left: closeShown,
+  };
 }
 
 /** What there is before the first step: the goal, and what the goal camera sees if the episode's table is on view. */
@@ -126,30 +131,15 @@ function drawHead(episode) {
 }
 
 /** To the round that was over after so many actions. */
-const goTo = (actions) => timeline.go(roundAt(shown.steps, actions));
+const goTo = (actions) => timeline.go(timeline.times[roundAt(shown.steps, actions)]);
 
 /** Once the slider rests: browsers refuse an address that changes with each pixel. */
 function noteStep() {
   clearTimeout(noting);
   const { id } = shown;
   noting = setTimeout(() => {
-    if (shown?.id === id) note({ step: timeline.step < timeline.last ? shownStep() : null });
+    if (shown?.id === id) note({ step: timeline.index < shown.steps.length - 1 ? shownStep() : null });
   }, NOTE_MS);
-}
-
-/** Shows a moment of the episode in the 3D view, or the live table for null. */
-function show3D(moment) {
-  if (moment && !moment.plays) noteStep();
-  const isAtEnd = !moment || (!moment.plays && moment.at_s >= timeline.at(timeline.last));
-  isLive = !moment || (isAtEnd && LIVE.has(shown.status));
-  if (isLive) showLive();
-  else if (shown.steps.length) replay({ episode: shown.id, ...moment }, `Recorded: ${shown.name}`);
-}
-
-/** Somebody wants to see the live table in the 3D view again. */
-export function followLive() {
-  isLive = true;
-  timeline.pause();
 }
 
 function drawStep(at) {
@@ -172,7 +162,8 @@ function drawStep(at) {
   drawBeside(shown, at);
   if (!step) return;
   showFrame(frameUrl(at));
-  if (timeline.timer && at < timeline.last) preload(frameUrl(at + 1));
+  if (!timeline.isPlaying) noteStep();
+  else if (at + 1 < shown.steps.length) preload(frameUrl(at + 1));
 }
 
 // Whether somebody came to see a certain episode; then one that runs already does not push in front of it.
@@ -194,14 +185,13 @@ function follow(job) {
 /** Takes the episode on view off it; one that runs comes back on view. */
 export function closeShown() {
   if (!shown) return;
-  timeline.pause();
   shown = null;
   wanted = null;
   closings += 1;
   note({ episode: null, step: null, beside: null });
   drawBeside(null, 0);
   byId("shown").hidden = true;
-  showLive();
+  timeline.close();
   const job = known("episode");
   if (LIVE.has(job?.state)) openEpisode(job.id);
 }
@@ -212,7 +202,7 @@ export function dropShown(id) {
 }
 
 /** The step that is on view, by its actions, for links. */
-export const shownStep = () => shown?.steps[timeline.step]?.step ?? 0;
+export const shownStep = () => shown?.steps[timeline.index]?.step ?? 0;
 
 /** After the service was lost: what is on view may have gone on. */
 export function refreshShown() {
@@ -230,13 +220,12 @@ function travel({ episode, step }) {
 export function setUpEpisodeView() {
   onTravel(travel);
   setUpPictures();
-  timeline = new Timeline(drawStep, show3D);
   setUpProgress(() => shown?.steps.at(-1)?.step ?? 0, goTo);
   byId("close-shown").addEventListener("click", closeShown);
   watch("objects", () => {
     if (!shown) return;
     drawHead(shown);
-    drawStep(timeline.step);
+    drawStep(timeline.index);
   });
   watch("episode", follow);
   watch("opened", (opened) => { if (opened) openEpisode(opened.id, opened.step); });

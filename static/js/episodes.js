@@ -27,7 +27,7 @@ function tookText(episode) {
 
 /** The table before and after; of a few kilobytes each, and only once they come into view. */
 function thumbnails(episode) {
-  if (LIVE.has(episode.status) || !episode.files.length) return el("span", { className: "thumbnails" });
+  if (LIVE.has(episode.status) || !episode.files.includes(ARCHIVE)) return el("span", { className: "thumbnails" }); // it saw nothing
   const picture = (at, what) => {
     const image = el("img", { src: `api/episodes/${encodeURIComponent(episode.id)}/thumbnail.png?at=${at}`, alt: what, width: 56, height: 56, loading: "lazy" });
     image.addEventListener("error", () => image.remove());

@@ -4,10 +4,12 @@ import { compose } from "./compose.js";
 import { byId } from "./dom.js";
 import { cancelEpisode, resetTable, startEpisode, stepOnce, togglePause } from "./episode.js";
 import { randomGoal } from "./goals.js";
+import { LIVE } from "./jobs.js";
 import { pushKey } from "./push.js";
 import { stopKey } from "./robot.js";
 import { anotherScene } from "./scenes.js";
-import { isLiveShown } from "./viewer.js";
+import { known } from "./state.js";
+import { timeline } from "./timeline.js";
 
 const OFF = "osf-keys-off";
 
@@ -21,7 +23,7 @@ const isPressed = (target) => Boolean(target.closest?.("button, a, summary, inpu
 // What ends or replaces something wants Shift as well, so that no single letter does it by accident.
 const COMMANDS = {
   s: () => startEpisode(),
-  " ": togglePause,
+  " ": () => (LIVE.has(known("episode")?.state) ? togglePause() : timeline.toggle()),
   ".": stepOnce,
   X: cancelEpisode,
   R: resetTable,
@@ -48,7 +50,7 @@ const isPlain = (event) => !(event.ctrlKey || event.metaKey || event.altKey || i
 
 function down(event) {
   if (event.defaultPrevented || !isPlain(event) || isTyping(event.target) || (event.key === " " && isPressed(event.target))) return;
-  if (isLiveShown() && byId("photo-stage").hidden && pushKey(event.key, true)) event.preventDefault();
+  if (!known("recorded") && byId("photo-stage").hidden && pushKey(event.key, true)) event.preventDefault();
   else take(event);
 }
 

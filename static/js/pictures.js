@@ -1,4 +1,5 @@
-// The pictures of a step: goal, now, estimate and difference, a wipe between the first two, and the cameras.
+// The pictures of a step: goal, now, estimate and difference, a wipe between the first two, and the cameras. Goal and now
+// are over the 3D view as well, and the cameras in their strip, while a recording is on view.
 // They come as one image of two rows of four captioned tiles, of which each place shows its part.
 import { LatestImage } from "./cameras.js";
 import { byId, el } from "./dom.js";
@@ -16,28 +17,21 @@ const alone = new Map(); // part -> image that stands in before there is a frame
 const frame = new LatestImage({
   set src(url) {
     for (const image of all) image.src = url;
-    byId("shown").classList.add("has-frame");
+    document.body.classList.add("has-frame");
   },
   removeAttribute(name) {
     for (const image of all) image.removeAttribute(name);
-    byId("shown").classList.remove("has-frame");
+    document.body.classList.remove("has-frame");
   },
 });
 
 /** A window onto one tile of the frame. */
-function crop({ part, label, row, column }, mode) {
+function crop({ label, row, column }) {
   const image = el("img", { alt: label, className: "part-of-frame" });
   image.style.left = `${-100 * column}%`;
   image.style.top = `${-100 * ((16 + 208 * row) / 192)}%`; // a caption of 16 px is above each tile of 192
   all.push(image);
-  const window = el("span", { className: "crop" }, image);
-  if (mode === "tile" && row === 0) {
-    const stand = el("img", { alt: "", className: "stand-in", hidden: true });
-    stand.addEventListener("error", () => { stand.hidden = true; });
-    alone.set(part, stand);
-    window.append(stand);
-  }
-  return window;
+  return el("span", { className: "crop" }, image);
 }
 
 export function showFrame(url) {
@@ -69,12 +63,19 @@ function showMode(mode) {
 export function setUpPictures() {
   for (const [set, parts] of Object.entries({ four: PARTS, cameras: CAMERAS })) {
     for (const part of parts) {
-      const figure = el("figure", {}, crop(part, "tile"), el("figcaption", { textContent: part.label }));
+      const figure = el("figure", {}, crop(part), el("figcaption", { textContent: part.label }));
       Object.assign(figure.dataset, { set, part: part.part });
       byId("tiles").append(figure);
     }
   }
-  const [goal, now] = PARTS.map((part) => crop(part, "wipe"));
+  for (const part of PARTS.slice(0, 2)) {
+    const stand = el("img", { alt: "", className: "stand-in", hidden: true });
+    stand.addEventListener("error", () => { stand.hidden = true; });
+    alone.set(part.part, stand);
+    byId(`pinned-${part.part}`).prepend(crop(part), stand);
+  }
+  for (const [i, tile] of [...byId("camera-strip").children].entries()) tile.prepend(crop([...CAMERAS, PARTS[0]][i]));
+  const [goal, now] = PARTS.slice(0, 2).map(crop);
   now.classList.add("over");
   byId("wipe-pair").append(goal, now);
   const wipe = () => { now.style.clipPath = `inset(0 ${byId("wipe-at").value}% 0 0)`; };

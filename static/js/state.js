@@ -9,13 +9,14 @@
 // `check` is what the service says of the goal and the table, null while it says nothing.
 // `driver` tells which visitor drives; `opened` is an episode that somebody wants to see, `report`
 // the one that was fetched last; `settings` what the form says, null if that cannot be used.
+// `recorded` tells whether a recording is on view in place of the live table.
 // `robot` is the robot of the service, whose host is null where it has none; `robotPictures` are addresses of what
 // its cameras saw last, by name.
 const state = {
   scene: undefined, objects: [], fields: undefined, training: undefined, estimate: undefined, episode: undefined,
   objectWork: undefined, clip: undefined, photoJob: undefined,
   camera: null, goals: [], goal: null, check: null, draft: null, driver: null, opened: null, report: null, settings: null,
-  robot: undefined, robotPictures: {},
+  recorded: false, robot: undefined, robotPictures: {},
 };
 const listeners = Object.fromEntries(Object.keys(state).map((what) => [what, []]));
 

@@ -1,11 +1,10 @@
-// What this is, shown before anybody clicks: a recorded episode in the 3D view, its goal, its table, and how far it is.
+// What this is, shown before anybody clicks: a recorded episode on the timeline, its goal, its table, and how far it is.
 import { asked } from "./address.js";
 import { get, post } from "./api.js";
 import { drawLegend } from "./charts.js";
 import { COLOURS, svg } from "./curves.js";
 import { byId } from "./dom.js";
 import { startEpisode } from "./episode.js";
-import { closeShown } from "./episode-view.js";
 import { takeGoal } from "./goals.js";
 import { LIVE } from "./jobs.js";
 import { refreshObjects } from "./objects.js";
@@ -13,12 +12,13 @@ import { length } from "./run-summary.js";
 import { refreshScenes } from "./scenes.js";
 import { known, labelOf, objects, set, watch } from "./state.js";
 import { showTab } from "./tabs.js";
+import { timeline } from "./timeline.js";
 import { act, tellFailure, toast } from "./toasts.js";
-import { isViewerShown, paceAgain, paceForStart, replayStory, showLive } from "./viewer.js";
+import { isViewOpen, paceAgain, paceForStart } from "./viewer.js";
 
-const TICK_MS = 80;
-const LENGTH_S = 11; // of a story; its replay is played as much faster as that takes
-const REST_S = 4; // at its end
+const SPEED = 2; // at which a story takes about ten seconds
+const REST_MS = 4000; // at its end
+const BEFORE = 2; // steps of the timeline before the first one of the episode: looking at the table, and at the goal
 const ROUNDS = 2; // of all stories, then the last one rests: an open page at rest costs nothing
 const WAIT_MS = 300;
 const PATIENCE_MS = 30_000; // with a 3D view that does not open; then pictures and curve play alone
@@ -26,114 +26,101 @@ const SEEN = "osf-story-seen";
 const [WIDTH, HEIGHT] = [300, 64];
 
 const isLinked = Boolean(asked().episode);
+const isStill = matchMedia("(prefers-reduced-motion: reduce)"); // then it stands until somebody plays it
 
 let stories = [];
 let number = 0; // of the one that plays, counted through all rounds
-let timer = 0;
-let since = 0;
+let resting = 0;
 let isOn = false;
 
 const story = () => stories[number % stories.length];
-const speed = () => Math.max(story().step_s.at(-1) / LENGTH_S, 1);
 const farthest = (left) => Math.max(...Object.values(left));
 
 // Drawing
 
-function stageAt(at, step) {
-  const { goal_look_s: goalLook, step_s: times, left_mm: left, pushes, took_s: took, light_off_deg: off } = story();
-  if (at < goalLook) return "Four cameras look: which pose of each object, and which lamp, explain what they see?";
-  if (at < times[0]) return `Lamp found to ${off.toFixed(1)}°. Now the photo: where should everything be?`;
-  if (step < times.length - 1) return `Push ${step + 1} of ${pushes}: purple is the plan, golden is the goal, wires are what it believes`;
+function stageAt(index) {
+  const { left_mm: left, pushes, took_s: took, light_off_deg: off } = story();
+  if (index === 0) return "Four cameras look: which pose of each object, and which lamp, explain what they see?";
+  if (index < BEFORE) return `Lamp found to ${off.toFixed(1)}°. Now the photo: where should everything be?`;
+  if (index - BEFORE < pushes) return `Push ${index - BEFORE + 1} of ${pushes}: purple is the plan, golden is the goal, wires are what it believes`;
   return `${length(farthest(left[0]))} to ${length(farthest(left.at(-1)))} in ${pushes} pushes; it took ${took.toFixed(0)} s on two CPU cores`;
 }
 
-function drawCurve(at) {
+function drawCurve(step) {
   const { objects, step_s: times, left_mm: left } = story();
   const end = times.at(-1);
   const most = Math.max(...left.map(farthest), 1);
-  const shown = times.filter((time) => time <= at).length;
   const lines = objects.map((name, i) => {
-    const points = left.slice(0, Math.max(shown, 1)).map((mm, k) => `${((WIDTH * times[k]) / end).toFixed(1)},${(HEIGHT - (HEIGHT - 4) * (mm[name] / most)).toFixed(1)}`);
+    const points = left.slice(0, step + 1).map((mm, k) => `${((WIDTH * times[k]) / end).toFixed(1)},${(HEIGHT - (HEIGHT - 4) * (mm[name] / most)).toFixed(1)}`);
     const line = svg("path", { d: `M0,${points[0].split(",")[1]} L${points.join(" L")}` });
     line.style.stroke = COLOURS[i % COLOURS.length];
     return line;
   });
   byId("story-curve").replaceChildren(svg("path", { d: `M0,${HEIGHT} H${WIDTH}`, class: "axis" }), ...lines);
-  const now = left[Math.max(shown - 1, 0)];
+  const now = left[step];
   drawLegend(byId("story-key"), objects.map((name, i) => ({ label: `${labelOf(name)} ${length(now[name])}`, colour: COLOURS[i % COLOURS.length] })));
 }
 
-function draw(at) {
+function draw(index) {
+  clearTimeout(resting);
   const { step_s: times, now_columns: columns } = story();
-  const step = Math.max(times.filter((time) => time <= at).length - 1, 0);
+  const step = Math.max(index - BEFORE, 0);
   const [column, row] = [step % columns, Math.floor(step / columns)];
   byId("story-now").style.transform = `translate(${(-100 * column) / columns}%, ${(-100 * row) / Math.ceil(times.length / columns)}%)`;
-  const stage = stageAt(at, step);
+  const stage = stageAt(index);
   if (byId("story-stage").textContent !== stage) byId("story-stage").textContent = stage; // it is read aloud
-  drawCurve(at);
-}
-
-function begin() {
-  const { goal_image: goal, now_image: now, now_columns: columns, objects } = story();
-  byId("story-goal").src = goal;
-  byId("story-now").src = now;
-  byId("story-now").style.width = `${100 * columns}%`;
-  byId("story-goal").alt = `The photo of how ${objects.map(labelOf).join(", ")} should lie`;
-  byId("story-again").hidden = true;
-  draw(0);
+  drawCurve(step);
 }
 
 // Playing
 
 async function play() {
-  clearInterval(timer);
-  begin();
-  let isOpen = false;
-  for (const until = performance.now() + PATIENCE_MS; isOn && !isOpen && performance.now() < until; ) {
-    isOpen = isViewerShown() && (await replayStory({ story: story().name, at_s: 0, plays: false, speed: 1 }));
-    if (!isOpen) await new Promise((resolve) => setTimeout(resolve, WAIT_MS));
-  }
-  if (!isOn) return;
-  await replayStory({ story: story().name, at_s: 0, plays: true, speed: speed() });
-  since = performance.now();
-  clearInterval(timer);
-  timer = setInterval(tick, TICK_MS);
+  const { name, title, goal_look_s: goalLook, step_s: times, goal_image: goal, now_image: now, now_columns: columns, objects } = story();
+  byId("story-goal").src = goal;
+  byId("story-now").src = now;
+  byId("story-now").style.width = `${100 * columns}%`;
+  byId("story-goal").alt = `The photo of how ${objects.map(labelOf).join(", ")} should lie`;
+  const source = {
+    of: { story: name }, name: title, isRunning: false, speed: SPEED,
+    times: [0, goalLook, ...times], actions: [0, 0, ...times.keys()],
+    draw, ended, left: closeStory,
+  };
+  timeline.show(source, 0);
+  const mayBegin = () => timeline.source === source && timeline.at === 0 && !timeline.isPlaying && !isStill.matches;
+  const until = performance.now() + PATIENCE_MS;
+  while (mayBegin() && performance.now() < until && !(await isViewOpen())) await new Promise((resolve) => setTimeout(resolve, WAIT_MS));
+  if (mayBegin()) timeline.play();
 }
 
-function tick() {
-  const at = (speed() * (performance.now() - since)) / 1000;
-  const end = story().step_s.at(-1);
-  draw(Math.min(at, end));
-  if (at < end + REST_S * speed()) return;
-  clearInterval(timer);
-  if (number + 1 < ROUNDS * stories.length && !document.hidden) {
+function ended() {
+  if (number + 1 >= ROUNDS * stories.length || document.hidden || isStill.matches) return;
+  resting = setTimeout(() => {
     number += 1;
     play();
-  } else byId("story-again").hidden = false;
+  }, REST_MS);
 }
 
 /** The story takes the place of the cameras, which show another table. */
 function show(on) {
-  byId("story").hidden = byId("story-foot").hidden = !on;
+  byId("story-foot").hidden = byId("story-goal").hidden = byId("story-now").hidden = !on;
   byId("cameras").hidden = on;
 }
 
 function open() {
   if (!stories.length || isOn) return;
-  closeShown(); // both would want the 3D view
   isOn = true;
   show(true);
   play();
 }
 
 /** Ends the story; the live table is on view again. */
-export function closeStory() {
+function closeStory() {
   if (!isOn) return;
   isOn = false;
-  clearInterval(timer);
+  clearTimeout(resting);
   show(false);
   sessionStorage.setItem(SEEN, "1");
-  showLive();
+  timeline.close();
 }
 
 // What to do next
@@ -184,24 +171,8 @@ export async function setUpStory() {
   run.addEventListener("click", () => act(run, runLive));
   byId("story-photo").addEventListener("click", usePhoto);
   byId("story-lamp").addEventListener("click", moveLamp);
-  byId("story-close").addEventListener("click", closeStory);
-  byId("story-again").addEventListener("click", () => {
-    number += 1;
-    play();
-  });
   byId("story-button").addEventListener("click", open);
-  // Whoever chooses another table or an episode wants to see that.
-  let table;
-  watch("scene", (scene) => {
-    if (scene && table && scene.id !== table) closeStory();
-    table = scene?.id ?? table;
-  });
-  watch("opened", (opened) => { if (opened) closeStory(); });
-  watch("report", (report) => { if (report) closeStory(); });
-  watch("episode", (job) => {
-    byId("story-button").disabled = LIVE.has(job?.state);
-    if (hasOtherPlans()) closeStory();
-  });
+  watch("episode", (job) => { byId("story-button").disabled = LIVE.has(job?.state); });
   const [answer] = await Promise.all([tellFailure(() => get("stories")), refreshObjects()]);
   // Those that can be run live come first.
   const answers = (answer?.stories ?? []).filter(({ outcome }) => outcome === "reached");

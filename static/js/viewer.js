@@ -1,17 +1,15 @@
 // The 3D view in its frame: the live table, or an episode in its place, as far as this page alone is concerned.
 import { VISITOR, post, put } from "./api.js";
 import { byId } from "./dom.js";
-import { isDriving } from "./driver.js";
 import { LIVE } from "./jobs.js";
 import { Newest } from "./newest.js";
-import { current, known, watch } from "./state.js";
+import { current, known, set, watch } from "./state.js";
 import { tellFailure } from "./toasts.js";
 
 const FRAMES_PER_S = { rest: 12, start: 0.3, run: 2 }; // of a view that no graphics card draws: before the first push, and then
 
 let replayed = null; // what is replayed, as the service was told last
 let shows = "meshes";
-let onLive = () => {};
 
 /** Whether an episode or estimate has been drawn on the table that is shown. */
 const drawsHere = (job) => Boolean(job) && job.state !== "queued" && job.params.scene === current()?.id;
@@ -30,45 +28,23 @@ export function showViewer() {
 
 export const isViewerShown = () => !byId("viewer").hidden;
 
-/** Whether the table that is pushed is the one on view. */
-export const isLiveShown = () => !replayed;
-
 /** What is golden: the goal that was chosen, until an episode has found its own. */
 const golden = () => (drawsHere(known("episode")) && known("episode").done > 0 ? null : known("goal")?.id ?? null);
 const show = () => put(`views/${VISITOR}`, { replay: replayed, shows, goal: golden() });
 const wish = new Newest(show);
 
-function ask(what) {
+/** Whether the service has a view of this page to draw in. */
+export const isViewOpen = async () => isViewerShown() && (await tellFailure(show))?.is_open;
+
+/** Shows a moment of a recording: {episode or story, at_s, plays, speed}; null for the live table. */
+export function replay(what) {
   replayed = what;
+  set("recorded", Boolean(what));
   tellNothing();
   wish.ask();
 }
 
-function draw(told) {
-  byId("replaying").hidden = !told;
-  byId("replaying-text").textContent = told;
-}
-
-/** Shows a moment of an episode: {episode, at_s, plays, speed}. `told` says what it is. */
-export function replay(what, told) {
-  draw(told);
-  ask(what);
-}
-
-/** Likewise for a story, without a word over it; resolves to whether the view is open already. */
-export async function replayStory(what) {
-  draw("");
-  replayed = what;
-  tellNothing();
-  const answer = await tellFailure(show);
-  return answer?.is_open;
-}
-
-/** Back to the live table. */
-export function showLive() {
-  draw("");
-  ask(null);
-}
+export const showLive = () => replay(null);
 
 /** A processor that also draws the view has more time for the search while there is one. */
 function pace(job) {
@@ -80,9 +56,7 @@ function pace(job) {
 export const paceForStart = () => pace({ state: "queued", done: 0 });
 export const paceAgain = () => pace(known("episode"));
 
-/** `listener` is told when somebody wants the live table back. */
-export function setUpViewer(listener) {
-  onLive = listener;
+export function setUpViewer() {
   watch("episode", pace);
   byId("viewer").addEventListener("load", () => {
     paceAgain();
@@ -105,15 +79,4 @@ export function setUpViewer(listener) {
       wish.ask();
     });
   }
-  const backToLive = () => {
-    onLive(); // first: what plays is stopped, and shown where it stopped
-    showLive();
-  };
-  byId("back-to-live").addEventListener("click", backToLive);
-  let table;
-  watch("scene", (scene) => {
-    const isOther = table !== undefined && scene && scene.id !== table;
-    table = scene === undefined ? undefined : scene?.id ?? null;
-    if (isOther && isDriving() && !byId("replaying").hidden) backToLive(); // whoever chooses a table wants to see it
-  });
 }

@@ -101,7 +101,7 @@ def rest(browser: Browser, url: str) -> dict[str, float]:
     """Cores that an open page takes while nothing moves."""
     page = browser.new_page(viewport={"width": 1440, "height": 900})
     page.goto(url)
-    page.click("#story-close", timeout=30_000)
+    page.click("#back-to-live", timeout=30_000)
     page.wait_for_timeout(1000 * SETTLE_S)
     service = next(
         int(place.name)

@@ -109,7 +109,7 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     assert (episode["status"], episode["done"]) == ("done", 3), episode["error"]
     page.wait_for_selector("#downloads a", timeout=WAIT_MS)
     assert page.eval_on_selector_all("#downloads a", "links => links.length") == len(episode["files"]) == 6
-    assert page.input_value("#timeline") == "3"
+    assert page.inner_text("#timeline-step") == "3 / 3"
     whole = "img => img.complete && img.naturalWidth === 768"
     until(lambda: page.eval_on_selector("#tiles img", whole))
     for chart in ("distance", "cost", "time"):
@@ -120,8 +120,8 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     assert "× real time" in page.inner_text("#first-seconds")
     page.select_option("#timeline-speed", "4")
     page.click("#timeline-play")
-    until(lambda: page.get_attribute("#timeline-play", "aria-label") == "Play the episode")
-    assert page.input_value("#timeline") == "3"
+    until(lambda: page.get_attribute("#timeline-play", "aria-label") == "Play the recording")
+    assert page.inner_text("#timeline-step") == "3 / 3"
     page.click("#watch-video")
     until(lambda: page.eval_on_selector("#shown-video", "video => video.readyState >= 2 && video.videoWidth === 768"))
     page.click("#make-clip")
@@ -133,15 +133,15 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     page.goto(f"{service.url}/?episode={episode['id']}&step=1")
     page.wait_for_selector("#clip:not([hidden])", timeout=WAIT_MS)
     page.wait_for_selector("#shown:not([hidden])", timeout=WAIT_MS)
-    until(lambda: page.input_value("#timeline") == "1")
+    until(lambda: page.inner_text("#timeline-step") == "1 / 3")
     page.click("#tab-drive")
     assert "tab=drive" in page.url
     page.go_back()
     until(lambda: page.get_attribute("#tab-episode", "aria-selected") == "true")
-    page.fill("#timeline", "2")
+    page.press("#timeline", "ArrowRight")
     until(lambda: "step=2" in page.evaluate("location.search"))
     page.reload()
-    until(lambda: page.input_value("#timeline") == "2")
+    until(lambda: page.inner_text("#timeline-step") == "2 / 3")
     page.wait_for_selector('#goal-image[alt^="Goal: how it should look"]', state="attached", timeout=WAIT_MS)
     page.click("#close-shown")
     assert "episode=" not in page.url

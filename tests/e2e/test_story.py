@@ -37,7 +37,7 @@ def page(browser, service):
     page = context.new_page()
     page.problems = []
     watch_errors(page)
-    page.on("console", lambda m: page.problems.append(m.text) if m.type == "error" else None)
+    page.on("console", lambda m: page.problems.append((m.text, m.location)) if m.type == "error" else None)
     page.goto(service.url)
     yield page
     assert page.problems == []
@@ -65,8 +65,35 @@ def test_a_story_plays_without_a_click_with_its_picture_and_curve(page):
     assert float(heights[-1]) > float(heights[0])  # it falls
 
 
+def test_it_is_paused_and_scrubbed_on_the_timeline(page):
+    until(lambda: "Push" in page.inner_text("#story-stage"))
+    page.click("#timeline-play")
+    at, shown = page.input_value("#timeline"), picture(page)
+    page.wait_for_timeout(500)
+    assert (page.input_value("#timeline"), picture(page)) == (at, shown)
+    page.press("#timeline", "Home")
+    until(lambda: "Four cameras look" in page.inner_text("#story-stage"))
+    page.press("#timeline", "End")
+    until(lambda: "pushes; it took" in page.inner_text("#story-stage"))
+    step = page.inner_text("#timeline-step")
+    page.press("#timeline", "ArrowLeft")
+    until(lambda: page.inner_text("#timeline-step") != step)
+    assert picture(page) != shown
+
+
+def test_where_less_motion_is_wanted_it_stands_still_until_it_is_played(browser, service):
+    page = browser.new_context(reduced_motion="reduce").new_page()
+    page.goto(service.url)
+    page.wait_for_selector("#viewer:not([hidden])", timeout=WAIT_MS)
+    page.wait_for_timeout(3000)
+    assert page.input_value("#timeline") == "0"
+    page.click("#timeline-play")
+    until(lambda: float(page.input_value("#timeline")) > 1)
+    page.context.close()
+
+
 def test_closed_it_stays_away_and_comes_back_on_demand(page):
-    page.click("#story-close", timeout=WAIT_MS)
+    page.click("#back-to-live", timeout=WAIT_MS)
     assert not page.is_visible("#story-foot")
     assert page.is_visible("#cameras")
     page.reload()
@@ -90,10 +117,17 @@ def test_it_runs_live_with_what_was_prepared_and_notices_a_turned_lamp(page, ser
     page.click("#story-run", timeout=WAIT_MS)
     episode = until(lambda: service.call("GET", "episodes")["episodes"])[0]
     until(lambda: service.call("GET", f"episodes/{episode['id']}")["done"] >= 1, LONG_MS / 1000)
-    first = service.call("GET", f"episodes/{episode['id']}")["steps"][0]["seconds"]
-    assert first["first"] < 5  # a look takes eleven
-    assert first["goal"] < 5
     until(lambda: "prepared with this example" in page.inner_text("#shown-text"))
+    assert page.is_visible("#pinned-goal")
+    assert page.is_visible("#pinned-now")
+    page.press("#timeline", "Home")
+    page.wait_for_selector("#replaying:not([hidden])", timeout=WAIT_MS)
+    seen = "#camera-strip .part-of-frame"
+    until(lambda: page.eval_on_selector(seen, "image => image.complete && image.naturalWidth > 0"))
+    assert page.is_visible(seen)
+    page.click("#back-to-live")
+    assert not page.is_visible("#replaying")
+    assert not page.is_visible(seen)
     page.click("#fool-turn", timeout=WAIT_MS)
     until(lambda: "You: The lamp was moved" in page.inner_text("#noticed-large"))
     until(lambda: "found again" in page.inner_text("#noticed-large"))

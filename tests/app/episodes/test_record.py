@@ -14,7 +14,7 @@ from app.episodes.request import SimulatedTable
 from app.episodes.trajectory import read_trajectory
 from osfcore.control.events import ActionExecuted, EpisodeSettings, Finished, GoalFound, Noticed, Observed, Stepped
 from osfcore.control.goal import GoalImage
-from osfcore.errors import CannotWrite
+from osfcore.errors import CannotWrite, OsfError
 from osfcore.geometry.cameras import default_cameras, goal_camera
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState
@@ -49,10 +49,10 @@ class Told:
         self.image = np.random.default_rng(0).random((SIDE, SIDE, 3))
         self.out = out
 
-    def record(self, truth, moved=(BOX,), **more):
+    def record(self, truth, moved=(BOX,), table=SimulatedTable, **more):
         symmetries = {name: asset.info.symmetry for name, asset in self.world.assets.items()}
         about = About(NAMES, 5, EpisodeSettings(steps=9), truth, moved, symmetries)
-        return EpisodeRecord(self.out, SimulatedTable(self.world), about, **more)
+        return EpisodeRecord(self.out, table(self.world), about, **more)
 
     def begin(self, record):
         record.take(Observed(0, self.world.observe()))
@@ -218,6 +218,34 @@ def test_whatever_is_broken_off_has_left_every_step_until_then(told):
         told.step(record, number, {"estimate": 0.5})
     files = {REPORT_FILE, CSV_FILE, GOAL_FILE, TRAJECTORY_FILE, FRAMES_FOLDER}
     assert {path.name for path in told.out.iterdir()} == files
+
+
+class Leaving:
+    """A table whose simulation ends when its second picture is taken."""
+
+    def __init__(self, world):
+        self.table, self.pictures = SimulatedTable(world), 0
+
+    def truth(self):
+        return self.table.truth()
+
+    def photo(self, camera):
+        self.pictures += 1
+        if self.pictures > 1:
+            raise OsfError("The simulation has ended.")
+        return self.table.photo(camera)
+
+
+def test_a_step_that_was_broken_off_before_its_picture_is_not_told(told):
+    record = told.record(told.goal, table=Leaving)
+    told.begin(record)
+    told.act(record, 1)
+    with pytest.raises(OsfError, match="has ended"):
+        told.step(record, 1, {"estimate": 0.5})
+    record.close()
+    report = json.loads((told.out / REPORT_FILE).read_text())
+    assert len(report["steps"]) == len(report["step_s"]) == 1
+    assert [path.name for path in (told.out / FRAMES_FOLDER).iterdir()] == ["000.png"]
 
 
 def test_a_long_episode_writes_its_files_ever_more_seldom_and_lacks_few_steps(told):

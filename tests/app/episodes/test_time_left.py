@@ -53,17 +53,28 @@ def test_a_look_of_any_length_is_known_better_the_longer_it_lasts():
 
 
 @pytest.mark.parametrize("each_s", [1.0, 7.0])
-def test_pushes_at_a_constant_rate_end_when_it_is_said(each_s):
+def test_pushes_at_a_constant_rate_end_about_when_it_is_said(each_s):
     course = Course()
-    pushed(course, 10, each_s, 0.2, 0.01)
+    pushed(course, 15, each_s, 0.2, 0.01)
     _, left = course.said[-1]
-    assert left == pytest.approx(10 * each_s)
+    assert 5 * each_s <= left < 15 * each_s  # as many as are needed, or some more, as usual
 
 
 def test_there_are_never_more_pushes_than_allowed():
     course = Course()
     pushed(course, MOST - 1, 2.0, 0.2, 1e-6)
-    assert course.said[-1][1] == pytest.approx(2.0)
+    assert course.said[-1][1] == pytest.approx(2.0, abs=0.1)
+
+
+def test_what_is_left_does_not_jump_when_nothing_seems_to_get_nearer_or_all_at_once():
+    course = Course()
+    pushed(course, 5, 1.0, 0.2, 0.0)
+    for number, off_m in enumerate((0.199, 0.1, 0.03, 0.02, 0.2, 0.19), start=6):
+        course.take(ActionExecuted(number, np.zeros(3)), 1.0)
+        course.take(stepped(number, off_m))
+    left = [one for _, one in course.said[::2]]
+    assert max(np.diff(left)) < 1.01  # a second has passed between them
+    assert min(np.diff(left)) > -0.3 * max(left)
 
 
 def test_the_share_never_falls_and_ends_at_one():
@@ -94,7 +105,7 @@ def test_who_does_not_look_for_goal_poses_needs_no_time_for_it():
 def test_where_distances_are_not_known_all_pushes_are_still_to_come():
     course = Course()
     unknown = np.zeros(0)
-    for number in range(11):
+    for number in range(31):
         course.take(Stepped(number, MOST, None, unknown, unknown, 0.0, np.zeros((1, 1, 3)), {}), 3.0)
         _, left = course.take(ActionExecuted(number + 1, unknown))
-    assert left == pytest.approx(3.0 * (MOST - 11))
+    assert left == pytest.approx(3.0 * (MOST - 31), abs=4.0)
