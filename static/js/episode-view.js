@@ -86,7 +86,7 @@ export function showEpisode(episode, step) {
   const at = Number.isFinite(step) ? roundAt(episode.steps, step) : wasAtEnd ? last : timeline.step;
   timeline.set(last, at, episode.step_s, episode.steps.map(({ step: actions }) => actions));
   drawEnding(episode);
-  drawResults(episode, isOther);
+  drawResults(episode);
   if (isOther) show3D(LIVE.has(episode.status) && !Number.isFinite(step) ? null : { at_s: timeline.at(at), plays: false, speed: 1 });
   if (!isOther) return;
   if (LIVE.has(episode.status)) scrollTo(byId("shown"));

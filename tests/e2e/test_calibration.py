@@ -29,8 +29,7 @@ def page(browser, port):
     page.problems = []
     watch_errors(page)
     leave_out_view(page)
-    page.goto(f"http://127.0.0.1:{port}/?tab=photo")
-    page.click("#calibration > summary")
+    page.goto(f"http://127.0.0.1:{port}/?tab=calibration")
     yield page
     page.close()
     assert page.problems == []

@@ -12,7 +12,7 @@ from PIL import Image
 from app.viewer.nodes.room import VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
 from osfcore.geometry.cameras import Camera
 from tests.app.processes.fields import write_box, write_exact_table
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import show_part, watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
 
@@ -97,7 +97,7 @@ def test_camera_images_stand_beside_what_the_fields_render(page, url):
     assert float(page.inner_text("#compare-dialog-title").split()[-2]) > 20
     page.keyboard.press("Escape")
     before = page.get_attribute(".part.rendered >> nth=0", "src")
-    page.click("#tab-drive")
+    show_part(page, "drive")
     page.fill("#elevation", "20")
     wait_until(lambda: page.get_attribute(".part.rendered >> nth=0", "src") != before, DRAW_S)
     page.uncheck("#compare")

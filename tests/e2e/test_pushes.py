@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.e2e.conftest import ARTIFACTS, watch_errors
+from tests.e2e.conftest import ARTIFACTS, show_part, watch_errors
 from tests.e2e.test_neural import call
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
@@ -113,7 +113,7 @@ def test_a_push_is_chosen_predicted_executed_and_compared(page, url):
     frame.get_by_role("button", name="Play").wait_for()
     page.screenshot(path=ARTIFACTS / "push_executed.png")
 
-    page.click("#tab-drive")
+    show_part(page, "drive")
     page.click("#reset")  # the table has changed by other hands
     frame.locator(".push-status:has-text('has changed')").wait_for()
     wait_until(lambda: purple(page) < kept)  # only the way of the pusher is left
