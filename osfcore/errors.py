@@ -104,7 +104,7 @@ class MissingAssets(OsfError):
         self.names = sorted(names)
         super().__init__(
             f"The meshes of these objects are not on this machine: {_listed(self.names)}; "
-            "fetch them under Objects on the page, or with 'osf assets fetch'."
+            "fetch them in Your objects on the page, or with 'osf assets fetch'."
         )
 
 

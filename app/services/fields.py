@@ -33,7 +33,7 @@ class MissingFields(OsfError):
     """Objects that can be neither rendered nor recognised."""
 
     def __init__(self, names: Collection[str]) -> None:
-        super().__init__(f"There is no field yet for {', '.join(names)}; train one under Fields.")
+        super().__init__(f"There is no field yet for {', '.join(names)}; train one in Your objects.")
         self.names = tuple(names)
 
 
@@ -42,7 +42,7 @@ class NoPublishedField(OsfError):
 
     def __init__(self, names: Collection[str]) -> None:
         super().__init__(
-            f"There is no field as published for {', '.join(names)}; choose our method, or train one under Fields."
+            f"There is no field as published for {', '.join(names)}; choose our method, or train one in Your objects."
         )
 
 

@@ -64,7 +64,7 @@ class TooManyScenes(OsfError):
     """No more scenes are kept."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"There are {limit} tables already, which is the most; delete one under Scenes first.")
+        super().__init__(f"There are {limit} tables already, which is the most; delete one in Lab, Scenes, first.")
 
 
 class Scenes:

@@ -234,7 +234,7 @@ class ClientView:
         """Say which objects have no field, once."""
         before, self._meshes = self._meshes, names
         if names and names != before:
-            text = f"Without a field, so still shown as meshes: {', '.join(names)}. Fields are trained under Fields."
+            text = f"Without a field, so still shown as meshes: {', '.join(names)}. Train them in Your objects."
             self.client.add_notification("Neural fields", text, auto_close_seconds=8.0)
 
     def _stop_waiting(self) -> None:

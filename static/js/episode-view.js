@@ -81,7 +81,7 @@ export function showEpisode(episode, step) {
   const source = sourceOf(episode);
   timeline.show(source, Number.isFinite(step) ? source.times[roundAt(episode.steps, step)] : undefined);
   drawEnding(episode);
-  drawResults(episode, isOther);
+  drawResults(episode);
   if (!isOther) return;
   if (LIVE.has(episode.status)) scrollTo(byId("shown"));
   else byId("shown").scrollIntoView({ block: "start" }); // somebody asked for it

@@ -37,10 +37,10 @@ function reason(changes = {}) {
   if (!known("goal")) return "Choose a goal first.";
   const fields = known("fields");
   const missing = fields ? scene.objects.filter(({ name }) => !fields.some((field) => field.name === name)) : [];
-  if (missing.length) return `No field has been learned of ${missing.map(({ label }) => label).join(", ")}; train one under Fields.`;
+  if (missing.length) return `No field has been learned of ${missing.map(({ label }) => label).join(", ")}; train one in Your objects.`;
   if (!chosenSettings()) return "A setting cannot be used; see Settings.";
   const unpublished = fields && isPublished() ? scene.objects.filter(({ name }) => !fields.find((field) => field.name === name).published) : [];
-  if (unpublished.length) return `There is no field as published of ${unpublished.map(({ label }) => label).join(", ")}; choose our method in Settings, or train one under Fields.`;
+  if (unpublished.length) return `There is no field as published of ${unpublished.map(({ label }) => label).join(", ")}; choose our method in Settings, or train one in Your objects.`;
   if (known("check")?.refused && !{ ...chosenSettings(), ...changes }.despite_doubts) return known("check").text;
   return "";
 }
@@ -120,7 +120,7 @@ function drawLive(job) {
   byId("run-told").textContent = isPaused ? PAUSED : "";
   byId("run-pause").textContent = isPaused ? "Resume" : "Pause";
   byId("run-pause").disabled = job.state === "queued";
-  byId("run-step").disabled = !isPaused;
+  byId("run-step").hidden = !isPaused;
 }
 
 function tellEnd(job) {

@@ -170,6 +170,7 @@ export function setUpEstimate() {
     event.preventDefault();
     act(form().querySelector("[type=submit]"), start);
   });
+  byId("observation-folder").webkitdirectory = true; // not an attribute of HTML
   for (const [button, input, action] of [
     ["upload-observation", "observation-file", (files) => send(files[0], files[0].name)],
     ["upload-folder", "observation-folder", sendFolder],

@@ -32,8 +32,10 @@ function entry(field) {
     el("div", { className: "row" },
       el("span", { className: "title", textContent: field.label, title: field.name }),
       field.source === "trained" ? deleteButton(field.name) : null),
-    el("span", { className: "state", textContent: quality }),
-    el("span", { className: "hint", textContent: `${(field.bytes / 1e6).toFixed(2)} MB, ${origin}${effort}` }),
+    el("details", {},
+      el("summary", { className: "hint", textContent: "Details" }),
+      el("p", { className: "state", textContent: quality }),
+      el("p", { className: "hint", textContent: `${(field.bytes / 1e6).toFixed(2)} MB, ${origin}${effort}` })),
     published(field),
     field.has_mesh ? null : el("span", { className: "missing", textContent: "needs a mesh for scenes", title: inWords(field.note ?? "") }),
   );
@@ -254,6 +256,7 @@ export function setUpFields() {
   byId("use-new-field").addEventListener("click", () => act(byId("use-new-field"), useNew));
   doubted(byId("delete-set"), "Really delete set", deleteSet);
   byId("training-image").addEventListener("error", () => drawPreview(""));
+  byId("to-fields").addEventListener("click", () => showTab("fields"));
   watch("objects", () => {
     const there = objects().filter((object) => object.available);
     options(form().elements.mesh, there.map((object) => [object.name, object.label]), "none fetched yet");

@@ -83,7 +83,7 @@ function draw(goal) {
   else image.removeAttribute("src");
   image.alt = goal ? `Goal: ${goal.name}` : "";
   byId("goal-drop").classList.toggle("filled", Boolean(goal));
-  byId("goal-name").textContent = goal?.name ?? "none yet";
+  byId("goal-name").textContent = goal?.name ?? "not chosen yet";
   byId("goal-origin").textContent = goal
     ? originText(goal, current()) : "What should the table look like? The examples above bring a goal with them.";
   byId("delete-goal").hidden = !goal;

@@ -18,7 +18,7 @@ const isTyping = (target) => Boolean(target.closest?.("input:not([type=checkbox]
 const isDialogOpen = () => document.querySelector("dialog[open]") !== null;
 
 // Space presses what has the focus.
-const isPressed = (target) => Boolean(target.closest?.("button, a, summary, input, [tabindex]"));
+const isPressed = (target) => Boolean(target.closest?.("button, a, summary, input, [tabindex]:not([role=tabpanel])"));
 
 // What ends or replaces something wants Shift as well, so that no single letter does it by accident.
 const COMMANDS = {

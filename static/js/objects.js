@@ -75,7 +75,7 @@ function actions(object) {
 
 function entry(object) {
   const title = el("span", { className: "title", textContent: object.label, title: `${object.name}, ${object.licence}, ${object.attribution}` });
-  const item = el("li", { className: object.available ? "object" : "object absent" }, thumbnail(object),
+  const item = el("li", { className: "object" }, thumbnail(object),
     el("div", { className: "object-facts" }, title, facts(object), el("div", { className: "actions" }, ...actions(object))));
   item.dataset.object = object.name;
   return item;

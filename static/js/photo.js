@@ -47,7 +47,7 @@ function tell() {
     add: `Click on the ${name.toLowerCase()}, or paint over what its outline lacks.`,
     remove: `Click beside the ${name.toLowerCase()}, or paint over what does not belong to it.`,
   };
-  byId("photo-told").textContent = chosen ? words[toolOf()] : "No object has a field yet; train one under Fields.";
+  byId("photo-told").textContent = chosen ? words[toolOf()] : "No object has a field yet; train one in Your objects.";
 }
 
 function choose(name, tool = marked(name) ? "add" : "box") {

@@ -1,41 +1,54 @@
-// The panel's tabs, with arrow keys as the ARIA pattern wants them.
+// The panel's tabs, and those within two of them, with arrow keys as the ARIA pattern wants them.
 import { asked, note, onTravel } from "./address.js";
 import { byId } from "./dom.js";
 
-const tabs = () => [...document.querySelectorAll('[role="tab"]:not([hidden])')];
+const tabsOf = (list) => [...list.querySelectorAll('[role="tab"]:not([hidden])')];
+const panelOf = (tab) => byId(tab.getAttribute("aria-controls"));
+/** What a tab puts on view: of the tabs within it the one that was chosen last, where there are any. */
+const nameOf = (tab) => (panelOf(tab).querySelector('[role="tab"][aria-selected="true"]') ?? tab).id.slice(4);
 
+/** Puts a part of the panel on view, as "photo", from its top. */
 export function showTab(name) {
+  choose(name);
+  scrollTo(byId(`panel-${name}`));
+}
+
+function choose(name) {
   note({ tab: name });
   draw(name);
 }
 
+/** What is hidden is not on view; what was chosen within a tab stays so while another tab is on view. */
 function draw(name) {
-  for (const tab of tabs()) {
-    const chosen = tab.id === `tab-${name}`;
-    tab.setAttribute("aria-selected", String(chosen));
-    tab.tabIndex = chosen ? 0 : -1;
-    byId(tab.getAttribute("aria-controls")).hidden = !chosen;
+  for (const list of document.querySelectorAll('[role="tablist"]')) {
+    const chosen = tabsOf(list).find((tab) => panelOf(tab).contains(byId(`panel-${name}`)));
+    for (const tab of tabsOf(list)) {
+      panelOf(tab).hidden = tab !== chosen;
+      if (!chosen) continue;
+      tab.setAttribute("aria-selected", String(tab === chosen));
+      tab.tabIndex = tab === chosen ? 0 : -1;
+    }
   }
 }
 
-/** The tab of the address; another name than that of a tab is none. */
+/** The part of the address; another name than that of one that can be shown is none. */
 function follow({ tab }) {
-  if (tabs().some(({ id }) => id === `tab-${tab}`)) draw(tab);
+  if (byId(`panel-${tab}`) && !byId(`tab-${tab}`)?.hidden) draw(tab);
 }
 
 export function setUpTabs() {
   follow(asked());
   onTravel(follow);
   for (const tab of document.querySelectorAll('[role="tab"]')) { // some are shown later
-    tab.addEventListener("click", () => showTab(tab.id.slice(4)));
+    tab.addEventListener("click", () => choose(nameOf(tab)));
     tab.addEventListener("keydown", (event) => {
       const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
       if (!step) return;
       event.preventDefault();
       event.stopPropagation();
-      const all = tabs();
+      const all = tabsOf(tab.closest('[role="tablist"]'));
       const next = all[(all.indexOf(tab) + step + all.length) % all.length];
-      showTab(next.id.slice(4));
+      choose(nameOf(next));
       next.focus();
     });
   }
@@ -43,7 +56,7 @@ export function setUpTabs() {
 
 /** Scrolls the panel so that a card of it begins at its top; the page itself stays where it is. */
 export function scrollTo(card) {
-  const panel = card.closest('[role="tabpanel"]');
+  const panel = card.closest('.panel > [role="tabpanel"]');
   if (getComputedStyle(panel).overflowY === "visible") { // on narrow screens the page scrolls
     card.scrollIntoView({ block: "start" });
     return;

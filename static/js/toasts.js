@@ -52,7 +52,7 @@ export async function tellFailure(action, near = null) {
 export const act = (button, action) => whileDisabled(button, () => tellFailure(action, button));
 
 export function tellMissingScene() {
-  toast("There is no scene yet; make one under Scenes.", "warning");
+  toast("There is no scene yet; make one in Lab, under Scenes.", "warning");
 }
 
 export function setUpToasts() {

@@ -10,7 +10,7 @@ function draw() {
   byId("welcome").hidden = current() !== null || !objects().length;
   byId("welcome-title").textContent = hasObjects() ? "The table is empty" : "No objects yet";
   byId("welcome-text").textContent = hasObjects()
-    ? "Choose an example under Episode, or make a scene: some objects at rest in random places under a random light."
+    ? "Choose an example under Try it, or make a scene: some objects at rest in random places under a random light."
     : "The scanned objects are fetched once, about 90 MB, and kept on this machine. A first scene follows by itself.";
   byId("welcome-button").textContent = hasObjects() ? "Make a scene" : "Fetch objects";
 }

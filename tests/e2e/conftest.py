@@ -32,6 +32,15 @@ def page_of_someone_who_knows(new_page, **options):
     return page
 
 
+def show_part(page, name: str):
+    """Choose a part of the panel as a person does: by its tab, and by the one within that."""
+    panel = page.locator(f'.panel > [role="tabpanel"]:has(#panel-{name}), .panel > #panel-{name}')
+    tab = panel.get_attribute("aria-labelledby")
+    page.click(f"#{tab}")
+    if page.locator(f"#tab-{name}").count():
+        page.click(f"#tab-{name}")
+
+
 def leave_out_view(page):
     """Let an empty frame stand for the 3D view: drawn without a GPU it takes time that other parts of the page need."""
     page.route(re.compile(r"/viewer/[^/]+/\?"), lambda route: route.fulfill(content_type="text/html", body=""))

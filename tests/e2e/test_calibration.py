@@ -8,7 +8,7 @@ import pytest
 from osfcore.photo.calibration import board_place
 from tests.app.api.test_calibration import ON_TABLE, TILTS, png_of
 from tests.app.api.test_photos import gray
-from tests.e2e.conftest import leave_out_view, watch_errors
+from tests.e2e.conftest import leave_out_view, show_part, watch_errors
 from tests.live import call, free_port, start_service, stop_service
 from tests.support.boards import K, tilted
 
@@ -29,8 +29,7 @@ def page(browser, port):
     page.problems = []
     watch_errors(page)
     leave_out_view(page)
-    page.goto(f"http://127.0.0.1:{port}/?tab=photo")
-    page.click("#calibration > summary")
+    page.goto(f"http://127.0.0.1:{port}/?tab=calibration")
     yield page
     page.close()
     assert page.problems == []
@@ -76,6 +75,7 @@ def test_a_camera_is_calibrated_saved_and_used(page, port):
     camera = json.loads(download.value.path().read_text())
     assert np.abs(np.array(camera["K"]) - K).max() < 3
     assert np.abs(np.array(camera["T_world_camera"]) - turned.matrix()).max() < 2e-3
+    show_part(page, "photo")
     page.set_input_files("#table-photo-file", {"name": "t.png", "mimeType": "image/png", "buffer": table})
     page.wait_for_selector("#photo-calibrated:not([hidden])")
     with page.expect_response(lambda answer: answer.request.method == "PATCH"):

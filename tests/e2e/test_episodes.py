@@ -7,7 +7,7 @@ import urllib.request
 
 import pytest
 
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import show_part, watch_errors
 from tests.live import free_port, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
@@ -116,14 +116,13 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
         assert page.locator(f"#chart-{chart} canvas").count() == 1
         assert page.get_attribute(f"#chart-{chart}", "aria-label") != "No steps yet"
     assert page.locator("#offset-rows tr").count() == len(NAMES)
+    page.click("#shown-details > summary")
     assert "SSIM 0." in page.inner_text("#shown-likeness")
     assert "× real time" in page.inner_text("#first-seconds")
     page.select_option("#timeline-speed", "4")
     page.click("#timeline-play")
     until(lambda: page.get_attribute("#timeline-play", "aria-label") == "Play the recording")
     assert page.inner_text("#timeline-step") == "3 / 3"
-    page.click("#watch-video")
-    until(lambda: page.eval_on_selector("#shown-video", "video => video.readyState >= 2 && video.videoWidth === 768"))
     page.click("#make-clip")
     page.wait_for_selector("#clip-state:not(:empty)", timeout=WAIT_MS)
     page.wait_for_selector("#clip:not([hidden])", timeout=LONG_MS)
@@ -134,10 +133,10 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     page.wait_for_selector("#clip:not([hidden])", timeout=WAIT_MS)
     page.wait_for_selector("#shown:not([hidden])", timeout=WAIT_MS)
     until(lambda: page.inner_text("#timeline-step") == "1 / 3")
-    page.click("#tab-drive")
+    show_part(page, "drive")
     assert "tab=drive" in page.url
     page.go_back()
-    until(lambda: page.get_attribute("#tab-episode", "aria-selected") == "true")
+    until(lambda: page.get_attribute("#tab-try", "aria-selected") == "true")
     page.press("#timeline", "ArrowRight")
     until(lambda: "step=2" in page.evaluate("location.search"))
     page.reload()

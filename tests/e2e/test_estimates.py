@@ -14,7 +14,7 @@ from PIL import Image
 from app.cli.collect import CollectObservationCommand
 from osfcore.io.observation_file import read_observation, write_observation
 from tests.app.services.test_image_sets import zipped
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import show_part, watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
 
@@ -55,7 +55,7 @@ def page(browser, url):
     page.on("console", lambda m: page.problems.append(m.text) if own(m) else None)
     page.goto(url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)
-    page.click("#tab-estimate")
+    show_part(page, "estimate")
     yield page
     page.close()
 

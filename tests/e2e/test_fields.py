@@ -34,7 +34,7 @@ def page(browser, url):
     page.on("console", lambda m: page.problems.append(m.text) if m.type == "error" else None)
     page.goto(url)
     page.wait_for_selector('#status[data-state="live"]', timeout=WAIT_MS)
-    page.click("#tab-fields")
+    page.click("#tab-objects")
     yield page
     page.close()
 
@@ -83,8 +83,8 @@ def test_from_a_mesh_to_a_field_with_preview_and_psnr(page, url):
     assert field["source"] == "trained"
     assert f"{get(url, 'jobs')['jobs'][0]['result']['before_mask']:.1f} dB in the mask" in told
     entry = page.locator(f'#field-list [data-field="{GELATIN}"]')
-    wait_until(lambda: f"{field['metrics']['psnr_mask']:.1f} dB in the mask" in entry.inner_text())
-    assert "trained here" in entry.inner_text()
+    wait_until(lambda: f"{field['metrics']['psnr_mask']:.1f} dB in the mask" in entry.text_content())
+    assert "trained here" in entry.text_content()
     assert "needs a mesh" not in entry.inner_text()
     assert page.problems == []
 

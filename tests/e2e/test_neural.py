@@ -16,7 +16,7 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from tests.app.processes.fields import write_box, write_exact_table
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import show_part, watch_errors
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
 
@@ -111,7 +111,7 @@ def test_camera_images_stand_beside_what_the_fields_render(page, url):
     assert float(page.inner_text("#compare-dialog-title").split()[-2]) > 20
     page.keyboard.press("Escape")
     before = page.get_attribute(".part.rendered >> nth=0", "src")
-    page.click("#tab-drive")
+    show_part(page, "drive")
     page.fill("#elevation", "20")
     wait_until(lambda: page.get_attribute(".part.rendered >> nth=0", "src") != before, DRAW_S)
     page.uncheck("#compare")

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.e2e.conftest import watch_errors
+from tests.e2e.conftest import leave_out_view, show_part, watch_errors
 from tests.live import free_port, live_service, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
 WAIT_MS = 20_000
+PARTS = ("episode", "photo", "objects", "fields", "drive", "scenes", "estimate", "calibration", "jobs")
+WCAG = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +67,7 @@ def tab(browser, service):
 
 @pytest.fixture
 def page(tab):
-    tab.click("#tab-drive")
+    show_part(tab, "drive")
     return tab
 
 
@@ -87,6 +89,24 @@ def camera_source(page, camera: str) -> str:
     return page.get_attribute(f'img[data-camera="{camera}"]', "src") or ""
 
 
+@pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
+def test_the_page_stands_still_while_it_loads(browser, service, size):
+    """Comes first: who else is on the page is told above the panel."""
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    page.add_init_script(
+        """sessionStorage.removeItem("osf-story-seen"); // with the story
+        window.shift = 0;
+        new PerformanceObserver((list) => {
+          for (const entry of list.getEntries()) if (!entry.hadRecentInput) window.shift += entry.value;
+        }).observe({ type: "layout-shift", buffered: true });"""
+    )
+    page.goto(service.url)
+    for awaited in ("#story-foot:not([hidden])", '#status[data-state="live"]', "#preset-list li", "#story-key li"):
+        page.wait_for_selector(awaited, timeout=WAIT_MS)
+    assert page.evaluate("shift") < 0.05
+    page.close()
+
+
 def test_page_loads_without_errors_or_foreign_requests(page, service):
     assert page.title() == "OSF manipulation"
     wait_until(lambda: all(camera_source(page, camera) for camera in ("0", "1", "2", "3", "goal")))
@@ -106,7 +126,7 @@ def test_viewer_shows_the_scene(page):
 
 @pytest.mark.parametrize("number", ["", "0", "99", "1.5"])
 def test_a_number_that_cannot_be_is_told_where_it_stands_and_not_sent(page, service, number):
-    page.click("#tab-episode")
+    show_part(page, "episode")
     page.evaluate("document.getElementById('table-card').open = true")
     posted = []
     note = lambda request: posted.append(request.url) if request.method == "POST" else None  # noqa: E731
@@ -123,14 +143,14 @@ def test_a_number_that_cannot_be_is_told_where_it_stands_and_not_sent(page, serv
 
 
 def test_chosen_objects_make_the_scene(page, service):
-    page.click("#tab-scenes")
+    show_part(page, "scenes")
     page.check('input[name="which"][value="chosen"]')
     page.check('#chips input[value="006_mustard_bottle"]')
     page.check('#chips input[value="003_cracker_box"]')
     page.fill('input[name="seed"]', "5")
     page.click("#new-scene [type=submit]")
     wait_until(lambda: service.scene()["seed"] == 5)
-    page.click("#tab-drive")
+    show_part(page, "drive")
     wait_until(lambda: page.locator("#poses tr").count() == 2)
     rows = page.locator("#poses tr").all_inner_texts()
     assert any("Mustard" in row for row in rows)
@@ -167,7 +187,7 @@ def test_a_held_button_keeps_pushing_and_reset_puts_everything_back(page, servic
 
 
 def test_keys_do_not_push_while_typing(page, service):
-    page.click("#tab-scenes")
+    show_part(page, "scenes")
     before = service.scene()["time_s"]
     page.focus('input[name="seed"]')
     page.keyboard.press("ArrowUp")
@@ -226,7 +246,7 @@ def test_an_image_opens_large(page):
 
 
 def test_collection_shows_progress_and_is_cancelled(page):
-    page.click("#tab-jobs")
+    show_part(page, "jobs")
     page.fill('#job-fields input[name="episodes"]', "500")
     page.click("#new-job [type=submit]")
     job = page.locator("#job-list li").first
@@ -238,7 +258,7 @@ def test_collection_shows_progress_and_is_cancelled(page):
 
 
 def test_a_finished_job_is_deleted_on_all_pages_after_asking_twice(page, service, browser):
-    page.click("#tab-jobs")
+    show_part(page, "jobs")
     page.fill('#job-fields input[name="episodes"]', "400")
     page.click("#new-job [type=submit]")
     wait_until(lambda: "of 400" in page.locator("#job-list li").first.inner_text(), 40)
@@ -269,7 +289,7 @@ def test_more_jobs_than_fit_a_page_are_shown_on_demand(page, service, browser):
     small = browser.new_page()
     small.route("**/api/jobs", lambda route: route.continue_(url=f"{service.url}/api/jobs?limit=1"))
     small.goto(service.url)
-    small.click("#tab-jobs")
+    show_part(small, "jobs")
     wait_until(lambda: small.locator("#job-list li").count() == 1)
     small.click("#more-jobs")
     wait_until(lambda: small.locator("#job-list li").count() == len(names))
@@ -280,7 +300,7 @@ def test_more_jobs_than_fit_a_page_are_shown_on_demand(page, service, browser):
 
 
 def test_a_mistake_is_told_in_words(page, service):
-    page.click("#tab-scenes")
+    show_part(page, "scenes")
     page.check('input[name="which"][value="chosen"]')
     while page.locator("#chips input:checked").count():
         page.locator("#chips input:checked").first.uncheck()
@@ -322,7 +342,7 @@ def test_page_without_objects_says_what_to_do(browser, tmp_path):
         page.goto(url)
         page.wait_for_selector("#welcome", timeout=WAIT_MS)
         assert page.inner_text("#welcome-button") == "Fetch objects"
-        page.click("#tab-scenes")
+        show_part(page, "scenes")
         assert page.is_visible("#no-objects")
         page.click("#new-scene [type=submit]")
         page.wait_for_selector(".beside-cause", timeout=WAIT_MS)  # the service says why not
@@ -339,10 +359,41 @@ def test_phone_has_no_sideways_scroll_in_either_theme(browser, service, scheme):
     ground = phone.evaluate("getComputedStyle(document.body).backgroundColor")
     brightness = np.mean([int(part) for part in ground.removeprefix("rgb(").removesuffix(")").split(",")])
     assert (brightness < 60) == (scheme == "dark")
-    for tab_name in ("episode", "scenes", "estimate", "objects", "fields", "jobs"):
-        phone.click(f"#tab-{tab_name}")
+    for part in PARTS:
+        show_part(phone, part)
         assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+    phone.evaluate("scrollTo(0, 300)")
+    box = phone.locator(".viewer").bounding_box()
+    assert box["y"] == 0  # it stays in sight
+    assert box["height"] < 400  # and leaves room for the rest
     context.close()
+
+
+def findings(page) -> list[str]:
+    """What axe-core finds on a page that has it: rules and where they are broken."""
+    found = page.evaluate("rules => axe.run(document, { runOnly: rules, resultTypes: ['violations'] })", WCAG)
+    return [f"{rule['id']}: {[node['target'] for node in rule['nodes']]}" for rule in found["violations"]]
+
+
+def test_axe_finds_nothing_in_any_part_theme_and_size(browser, service):
+    axe = pytest.importorskip("axe_playwright_python.base")
+    page = browser.new_page(color_scheme="light")
+    leave_out_view(page)
+    page.goto(service.url)
+    page.wait_for_selector("#poses tr", state="attached", timeout=WAIT_MS)
+    page.evaluate(axe.AXE_SCRIPT)
+    for theme in ("light", "dark"):
+        for width, height in ((1440, 900), (390, 844)):
+            page.set_viewport_size({"width": width, "height": height})
+            for part in PARTS:
+                show_part(page, part)
+                assert findings(page) == [], f"{part}, {theme}, {width} wide"
+        page.click("#story-button")
+        page.wait_for_selector("#story-foot:not([hidden])", timeout=WAIT_MS)
+        assert findings(page) == [], f"story, {theme}"
+        page.click("#story-close")
+        page.click("#theme-button")
+    page.close()
 
 
 def test_theme_is_remembered(page):

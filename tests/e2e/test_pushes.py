@@ -12,7 +12,7 @@ from app.services.pushes import beyond_nearest, toward
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
-from tests.e2e.conftest import ARTIFACTS, watch_errors
+from tests.e2e.conftest import ARTIFACTS, show_part, watch_errors
 from tests.e2e.test_neural import call, seen_at
 from tests.e2e.test_page import WAIT_MS, wait_until
 from tests.live import live_service
@@ -122,7 +122,7 @@ def test_a_push_is_dragged_predicted_executed_and_compared(page, url, library):
     frame.get_by_role("button", name="Play").wait_for()
     page.screenshot(path=ARTIFACTS / "push_executed.png")
 
-    page.click("#tab-drive")
+    show_part(page, "drive")
     page.click("#reset")  # the table has changed by other hands
     frame.locator(".push-status:has-text('has changed')").wait_for()
     wait_until(lambda: purple(page) < kept)  # only the way of the pusher is left

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.e2e.conftest import ARTIFACTS, watch_errors
+from tests.e2e.conftest import ARTIFACTS, show_part, watch_errors
 from tests.live import free_port, start_service, stop_service
 from tests.support.robots import NAMES, example, noted, serving, simulated, toward_middle, until
 
@@ -46,6 +46,7 @@ def page(browser, service):
     page.problems = []
     watch_errors(page)
     page.goto(service)
+    page.click("#tab-lab")
     page.click("#tab-robot", timeout=WAIT_MS)  # comes once the robot has been asked for
     page.wait_for_selector("#panel-robot:not([hidden])", timeout=WAIT_MS)
     yield page
@@ -89,11 +90,11 @@ def test_it_shows_what_the_cameras_of_the_robot_see_and_how_old_that_is(page, ro
     captions = page.locator("#robot-cameras span").all_inner_texts()
     assert [caption.partition(", ")[0] for caption in captions] == ["0", "1", "2", "3"]
     assert all(re.fullmatch(r"\d, (now|\d+ s ago)", caption) for caption in captions)
-    assert "the tab Robot" in page.inner_text("#robot-elsewhere")
+    assert "under Robot" in page.inner_text("#robot-elsewhere")
     ARTIFACTS.mkdir(exist_ok=True)
     page.screenshot(path=ARTIFACTS / "robot-cameras.png")
     robot[2].clear()
-    page.click("#tab-scenes")
+    show_part(page, "scenes")
     page.wait_for_timeout(1000)  # for what was asked before
     robot[2].clear()
     page.wait_for_timeout(3000)

@@ -51,7 +51,7 @@ def picture(page):
 
 def test_a_story_plays_without_a_click_with_its_picture_and_curve(page):
     page.wait_for_selector("#story-foot:not([hidden])", timeout=WAIT_MS)
-    assert "photo of how a tabletop should look" in page.inner_text(".story-what")
+    assert "how a tabletop should look" in page.inner_text(".story-what")
     assert page.locator(".story-buttons button:visible").count() >= 3
     assert not page.is_visible("#cameras")
     until(lambda: page.eval_on_selector("#story-goal", "image => image.complete && image.naturalWidth > 0"))
