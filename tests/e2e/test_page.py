@@ -391,7 +391,7 @@ def test_axe_finds_nothing_in_any_part_theme_and_size(browser, service):
         page.click("#story-button")
         page.wait_for_selector("#story-foot:not([hidden])", timeout=WAIT_MS)
         assert findings(page) == [], f"story, {theme}"
-        page.click("#story-close")
+        page.click("#back-to-live")
         page.click("#theme-button")
     page.close()
 
