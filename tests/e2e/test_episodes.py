@@ -151,7 +151,7 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
 def test_a_goal_is_composed_on_the_map_and_kept(page, service):
     page.click("#compose")
     page.wait_for_selector("#composing:not([hidden])", timeout=WAIT_MS)
-    until(lambda: page.eval_on_selector("#draft-image", "img => img.complete && img.naturalWidth > 0"))
+    until(lambda: page.eval_on_selector("#draft-image", "img => img.complete && img.naturalWidth > 1"))
     scene = service.call("GET", "scenes")
     now = next(s for s in scene["scenes"] if s["id"] == scene["current"])["objects"][0]
     disc = f'#goal-map [data-object="{now["name"]}"]'
@@ -263,7 +263,7 @@ def test_two_runs_are_compared_side_by_side_and_one_is_run_again(page, service):
     assert ["Samples", "8", "16"] in rows
     assert [row[0] for row in rows] == ["Distance", "Pushes", "Time", "Ended", "Samples"]
     assert page.locator("#beside-chart canvas").count() == 1
-    until(lambda: page.eval_on_selector("#beside-other", "image => image.complete && image.naturalWidth > 0"))
+    until(lambda: page.eval_on_selector("#beside-other", "image => image.complete && image.naturalWidth > 1"))
     fits = "card => [...card.querySelectorAll('*')].every((part) => part.getBoundingClientRect().right <= innerWidth)"
     assert page.eval_on_selector("#beside-card", fits)
     assert f"beside={ran[1]}" in page.url
