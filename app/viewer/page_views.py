@@ -107,12 +107,12 @@ class _View:
         self._shown = version
         return self.nodes
 
-    def show_goal(self, goal: GoalRecord | None, library: AssetLibrary) -> None:
-        """Show where objects of the live table should be."""
+    def show_goal(self, goal: GoalRecord | None, library: AssetLibrary) -> bool:
+        """Show where objects of the live table should be; returns whether more has to be in view than before."""
         before, nodes = self._goal
         name = "" if goal is None else goal.id
         if name == before:
-            return
+            return False
         for node in nodes:
             node.remove()
         poses = () if goal is None else goal.poses or ()
@@ -120,6 +120,7 @@ class _View:
         for node, (_, pose) in zip(nodes, poses, strict=True):
             node.position, node.wxyz = pose.position, pose.quaternion
         self._goal = name, nodes
+        return bool(nodes)
 
     def frame(self, points_m: Float[np.ndarray, "N 3"]) -> None:
         """Let the camera stand where points fill the view [m]."""
@@ -276,7 +277,9 @@ class PageViews(Panel):
             wish, since = page.wish, page.since
             framed, page.framed = page.framed, None
         root, replay = "", wish.replay
-        view.show_goal(wish.goal if replay is None else None, self._library)
+        goal = wish.goal if replay is None else None
+        if view.show_goal(goal, self._library):
+            framed = framed or self._live()
         if replay is None:
             view.close()
         else:
@@ -293,7 +296,7 @@ class PageViews(Panel):
         hidden = _TRUTH if wish.shows == "beliefs" else (_TRACKED,)
         view.picture.hidden.hide("page", {f"{root}{path}" for path in hidden})
         if framed is not None and framed.names:
-            view.frame(extent_m(framed, self._library))
+            view.frame(extent_m(framed, self._library, goal.poses or () if goal else ()))
         self.neural.switch(view.picture, is_on=wish.shows == "fields")
         self.neural.moved(view.picture)
 

@@ -54,7 +54,7 @@ def test_a_story_plays_without_a_click_with_its_picture_and_curve(page):
     assert "how a tabletop should look" in page.inner_text(".story-what")
     assert page.locator(".story-buttons button:visible").count() >= 3
     assert not page.is_visible("#cameras")
-    until(lambda: page.eval_on_selector("#story-goal", "image => image.complete && image.naturalWidth > 0"))
+    until(lambda: page.eval_on_selector("#story-goal", "image => image.complete && image.naturalWidth > 1"))
     until(lambda: "Push" in page.inner_text("#story-stage"))
     before = picture(page)
     until(lambda: picture(page) != before)
@@ -123,7 +123,7 @@ def test_it_runs_live_with_what_was_prepared_and_notices_a_turned_lamp(page, ser
     page.press("#timeline", "Home")
     page.wait_for_selector("#replaying:not([hidden])", timeout=WAIT_MS)
     seen = "#camera-strip .part-of-frame"
-    until(lambda: page.eval_on_selector(seen, "image => image.complete && image.naturalWidth > 0"))
+    until(lambda: page.eval_on_selector(seen, "image => image.complete && image.naturalWidth > 1"))
     assert page.is_visible(seen)
     page.click("#back-to-live")
     assert not page.is_visible("#replaying")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import cv2
 import numpy as np
@@ -385,18 +385,26 @@ def level_point(
     return point if np.abs(point[:2]).max() <= TABLE_SIDE_M / 2 else None
 
 
-def extent_m(state: SceneState, library: AssetLibrary) -> Float[np.ndarray, "P 3"]:
-    """Return points around all that a scene shows: corners of boxes around things, and the lamp's mark [m]."""
+def extent_m(
+    state: SceneState, library: AssetLibrary, goal: Sequence[tuple[str, Pose]] = ()
+) -> Float[np.ndarray, "P 3"]:
+    """Return points around all that is on view: corners of boxes around things, and the lamp's mark [m].
+
+    Args:
+        state: the scene.
+        library: sizes of the objects.
+        goal: objects, and where they should be.
+    """
     corners = [np.asarray(AT * state.light.position)[None]]
     if state.pusher is not None:
         half = np.array([PUSHER_RADIUS_M, PUSHER_RADIUS_M, PUSHER_HEIGHT_M / 2])
         corners.append(state.pusher + half * _SIGNS)
-    for name in state.names:
+    for name, pose in (*((name, state.pose(name)) for name in state.names), *goal):
         try:
             half = library.size_m(name) / 2
         except OsfError:  # removed since
             half = np.full(3, UNKNOWN_M / 2)
-        corners.append(state.pose(name).apply(half * _SIGNS))
+        corners.append(pose.apply(half * _SIGNS))
     return np.concatenate(corners)
 
 
