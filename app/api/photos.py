@@ -226,6 +226,13 @@ class GoalMadeOut(TableMadeOut):
     goal: GoalOut
 
 
+class PictureOut(BaseModel):
+    """What became of a picture: one of both."""
+
+    goal: GoalOut | None = Field(description="It is one of the goal camera.")
+    photo: TablePhotoOut | None = Field(description="It is a photograph, in which objects can be marked and found.")
+
+
 def _facts(photo: TablePhoto) -> PhotoFacts:
     return PhotoFacts(
         id=photo.id,
@@ -268,6 +275,10 @@ def _lists(points: Points) -> list[list[float]]:
 UPLOAD_PATH = "/api/photos"
 _PHOTO_BODY = upload("image/*", description="A photo.")
 router = APIRouter(prefix=UPLOAD_PATH, tags=["photos"], responses=problems(), route_class=BoundedRoute)
+PICTURES_UPLOAD_PATH = "/api/pictures"
+pictures_router = APIRouter(
+    prefix=PICTURES_UPLOAD_PATH, tags=["photos"], responses=problems(), route_class=BoundedRoute
+)
 ObjectPath = Annotated[Identifier, Path(description="Name of an object.", examples=["025_mug"])]
 
 
@@ -308,6 +319,15 @@ async def create(
     photo = await run_in_threadpool(services.photos.receive, data, name, focal_px)
     response.headers["Location"] = f"{UPLOAD_PATH}/{photo.id}"
     return _out(services, photo)
+
+
+@pictures_router.post("", status_code=201, responses=problems(409, 415, 503, 507), openapi_extra=_PHOTO_BODY)
+async def create_picture(
+    services: ServicesDep, request: Request, name: Annotated[DisplayName, Query(description="For people.")] = "Photo"
+) -> PictureOut:
+    """Keep a picture as what it is: a goal if it is one of the goal camera, else a photo of a table."""
+    data = await _photo_body(request, services.settings.max_photo_bytes)
+    return await services.slow_lane.run(_kept, services, data, name)
 
 
 @router.get("")
@@ -413,6 +433,13 @@ def drawing(services: ServicesDep, photo: PhotoDep) -> Response:
     """Show how the scene that was found looks from the photo's camera, with its shadows."""
     png = services.photo_tables.drawing(photo.id)
     return Response(png, media_type="image/png", headers={"Cache-Control": "no-store"})
+
+
+def _kept(services: Services, data: bytes, name: str) -> PictureOut:
+    picture = services.goals.read(data)
+    if services.goal_checks.is_goal_view(picture):
+        return PictureOut(goal=GoalOut.of(services.goals.receive_read(picture, name)), photo=None)
+    return PictureOut(goal=None, photo=_out(services, services.photos.receive(data, name)))
 
 
 def _out(services: Services, photo: TablePhoto) -> TablePhotoOut:

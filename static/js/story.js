@@ -164,12 +164,6 @@ async function runLive() {
   }
 }
 
-function usePhoto() {
-  closeStory();
-  showTab("photo");
-  byId("table-photo-file").click();
-}
-
 function moveLamp() {
   closeStory();
   showTab("drive");
@@ -182,7 +176,7 @@ const hasOtherPlans = () => LIVE.has(known("episode")?.state) || Boolean(known("
 export async function setUpStory() {
   const run = byId("story-run");
   run.addEventListener("click", () => act(run, runLive));
-  byId("story-photo").addEventListener("click", usePhoto);
+  byId("story-photo").addEventListener("click", closeStory); // the page then asks for the photo
   byId("story-lamp").addEventListener("click", moveLamp);
   byId("story-close").addEventListener("click", closeStory);
   byId("story-again").addEventListener("click", () => {
