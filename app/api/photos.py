@@ -190,7 +190,7 @@ class PhotoFacts(BaseModel):
     width: int = Field(description="[px]")
     height: int = Field(description="[px]")
     focal_px: float = Field(description="In pixels of the photo as it was sent.")
-    focal_source: CameraSource = Field(description="Where it comes from: the board, the user, the file, or nowhere.")
+    focal_source: CameraSource = Field(description="The board, the user, the file, how objects stand, or nothing.")
     on_board: bool = Field(description="Whether the printed board is in view.")
 
 
@@ -448,7 +448,7 @@ def _out(services: Services, photo: TablePhoto) -> TablePhotoOut:
     by_name = {} if job is None or found is None else {one.name: _found(job, one) for one in found.objects}
     labels = services.objects.labels()
     return TablePhotoOut(
-        **_facts(photo).model_dump(),
+        **_facts(photo if found is None else photo.as_found(found)).model_dump(),
         notes=list(photo.notes) if found is None else found.notes,
         objects=[_marked(one, labels.get(one.name, one.name), by_name.get(one.name)) for one in photo.objects],
         job=None if job is None else JobOut.of(job),
