@@ -13,7 +13,7 @@ import tyro
 
 from app.cli.command import Command, DataCommand, check_out, choice_of, last_of
 from osfcore.errors import InvalidInput, UnknownName, shown
-from osfcore.io.files import write_atomically, write_json
+from osfcore.io.files import write_atomically, write_json, writing
 from osfcore.io.json_codec import encode
 from osfcore.photo import calibration
 from osfcore.photo.board import Board, board_pdf
@@ -261,4 +261,22 @@ def _summary(result: dict[str, Any]) -> Iterator[str]:
     yield from result["notes"]
 
 
-Photo = choice_of(board=PhotoBoard, calibrate=PhotoCalibrate, estimate=PhotoEstimate)
+@dataclass(frozen=True)
+class PhotoSample(DataCommand):
+    """Draw the sample photo that the page offers, from scans, with a box around each object beside it."""
+
+    out: Path
+    """Folder to write table.jpg and table.json to; made if it does not exist."""
+
+    def run(self) -> dict[str, Any]:
+        """Draw and write it."""
+        from osfcore.experiments.sample_photo import BOXES, PHOTO, write_sample_photo
+
+        with writing(self.out):
+            self.out.mkdir(parents=True, exist_ok=True)
+            write_sample_photo(self.assets, self.out)
+        self.say(f"Wrote {self.out / PHOTO} and {self.out / BOXES}.")
+        return {"photo": str(self.out / PHOTO), "boxes": str(self.out / BOXES)}
+
+
+Photo = choice_of(board=PhotoBoard, calibrate=PhotoCalibrate, estimate=PhotoEstimate, sample=PhotoSample)

@@ -241,7 +241,8 @@ function inTurn(work) {
   };
 }
 
-async function find() {
+/** Begins the search for what is marked. */
+export async function findObjects() {
   const together = [...byId("photo-together").querySelectorAll("input:checked")].map(({ value }) => value);
   show(await post(path("/find"), { together, seed: 0 }));
 }
@@ -302,7 +303,7 @@ export function setUpPhoto() {
   for (const radio of document.getElementsByName("photo-tool")) radio.addEventListener("change", () => chooseTool(radio.value));
   byId("photo-brush").addEventListener("input", ({ target }) => setBrush(Number(target.value)));
   byId("find-objects").addEventListener("click", async () => {
-    await act(byId("find-objects"), find);
+    await act(byId("find-objects"), findObjects);
     drawJob(photo?.job);
   });
   byId("photo-undo").addEventListener("click", () => act(byId("photo-undo"), async () => {
@@ -328,6 +329,7 @@ export function setUpPhoto() {
     return tellFailure(async () => {
       show(await get(path()));
       if (isFound() && photo.table) wipeTo(50);
+      if (isFound()) byId("photo-result").scrollIntoView({ block: "nearest" });
     });
   });
 }

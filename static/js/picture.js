@@ -1,10 +1,10 @@
 // One way in for any picture: one of the goal camera becomes the goal, a photograph opens so that objects can be marked.
-import { ApiError, problemOf, upload } from "./api.js";
+import { ApiError, problemOf, put, upload } from "./api.js";
 import { openCrop } from "./crop.js";
 import { byId, whileDisabled } from "./dom.js";
 import { mayDrive } from "./driver.js";
 import { takeGoal } from "./goals.js";
-import { showPhoto } from "./photo.js";
+import { findObjects, showPhoto } from "./photo.js";
 import { known } from "./state.js";
 import { showTab } from "./tabs.js";
 import { act, tellFailure } from "./toasts.js";
@@ -47,8 +47,8 @@ export async function sendPicture(file) {
   bar.hidden = true;
 }
 
-async function fileOf(path, name) {
-  const answer = await fetch(`api/${path}/photo.jpg`);
+async function fileOf(address, name) {
+  const answer = await fetch(address);
   if (!answer.ok) throw new ApiError(await problemOf(answer), answer.status);
   return new File([await answer.blob()], name, { type: "image/jpeg" });
 }
@@ -56,15 +56,27 @@ async function fileOf(path, name) {
 /** A photograph is cropped to what the goal camera would see. */
 async function cropPhoto() {
   const { id, name } = known("photo");
-  useGoal(await send("goals", await fileOf(`photos/${encodeURIComponent(id)}`, name)));
+  useGoal(await send("goals", await fileOf(`api/photos/${encodeURIComponent(id)}/photo.jpg`, name)));
   openCrop();
 }
 
 /** Objects are looked for in the photo of a goal. */
 async function markGoal() {
   const { id, name } = known("goal");
-  const photo = await send("photos", await fileOf(`goals/${encodeURIComponent(id)}`, name));
+  const photo = await send("photos", await fileOf(`api/goals/${encodeURIComponent(id)}/photo.jpg`, name));
   await showPhoto(photo.id);
+}
+
+/** A photo that comes with the page is sent, marked as its boxes say, and looked at. */
+async function trySample() {
+  if (!mayDrive()) return;
+  const photo = await send("photos", await fileOf("samples/table.jpg", "Sample photo"));
+  const boxes = await (await fetch("samples/table.json")).json();
+  for (const [name, box] of Object.entries(boxes)) {
+    await put(`photos/${photo.id}/objects/${name}`, { box, on: [], off: [], strokes: [] });
+  }
+  await showPhoto(photo.id);
+  await findObjects();
 }
 
 export function setUpPicture() {
@@ -76,6 +88,7 @@ export function setUpPicture() {
     if (chosen) whileDisabled(button, () => sendPicture(chosen));
     file.value = "";
   });
+  byId("sample-photo").addEventListener("click", () => act(byId("sample-photo"), trySample));
   byId("photo-crop").addEventListener("click", () => act(byId("photo-crop"), cropPhoto));
   byId("check-mark").addEventListener("click", () => act(byId("check-mark"), markGoal));
 }
