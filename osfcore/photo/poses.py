@@ -458,23 +458,18 @@ class _FocalSearch:
             self._costs[focal] = sum(losses) + _ON_TABLE_WEIGHT * off
 
     def best(self) -> float | None:
-        """Return the focal length of least cost [px]; None if objects stand on one table at none."""
+        """Return the focal length of least cost [px]; None if that is at an end of the grid, or none has a table."""
         focals = np.array(sorted(self._costs))
         costs = np.array([self._costs[focal] for focal in focals])
         k = int(np.argmin(costs))
-        if costs[k] >= _NOT_ON_TABLE * len(self._found):
+        if k in (0, len(costs) - 1) or costs[k] >= _NOT_ON_TABLE * len(self._found):
             return None
-        if k in (0, len(costs) - 1):
-            return float(focals[k])
         left, middle, right = costs[k - 1 : k + 2]
         shift = 0.5 * (left - right) / max(left - 2 * middle + right, 1e-9)
         return float(focals[k] * (focals[k + 1] / focals[k]) ** np.clip(shift, -0.5, 0.5))
 
-    def found_at(self, focal: float) -> list[PhotoObject]:
-        """Return all objects with their poses as a camera of that focal length sees them, the best first."""
-        return [self._moved(one, focal) for one in self._found]
-
-    def _moved(self, one: PhotoObject, focal: float) -> PhotoObject:
+    def moved(self, one: PhotoObject, focal: float) -> PhotoObject:
+        """Return an object with its poses as a camera of that focal length sees it, the best first."""
         loss = self._loss(one, focal)
         poses = Pose.stacked(self._aligned(one, each.pose, focal)[0] for each in (one.best, *one.rivals))
         ready = _photo_poses(poses, loss)
@@ -799,14 +794,16 @@ def estimate_photo(
         yield PhotoStep(Progress(done, total, f"Looking for {names[number]} behind the others"), tuple(found))
         found[number], seen[names[number]] = _found_behind(models, photos, found, number, rng, config)
     intrinsics = None
-    if not (on_table[0] or config.focal_known) and len(found) >= _FEWEST_OBJECTS:
-        search, total = _FocalSearch(models, photos[0], found, config), total + len(_FOCAL_FACTORS)
+    fitting = [one for one in found if fits_outline(one.best)]
+    if not (on_table[0] or config.focal_known) and len(fitting) >= _FEWEST_OBJECTS:
+        search, total = _FocalSearch(models, photos[0], fitting, config), total + len(_FOCAL_FACTORS)
         for done, factor in enumerate(_FOCAL_FACTORS, len(names) + len(again)):
             focal = factor * photos[0].intrinsics[0, 0]
             yield PhotoStep(Progress(done, total, f"Trying a focal length of {focal:.0f} pixels"), tuple(found))
             search.try_out(focal)
         if (focal := search.best()) is not None:
-            intrinsics, found = _with_focal(photos[0].intrinsics, focal), search.found_at(focal)
+            intrinsics = _with_focal(photos[0].intrinsics, focal)
+            found = [search.moved(one, focal) for one in found]
             photos = [replace(photos[0], intrinsics=intrinsics)]
             seen = {name: [replace(its[0], intrinsics=intrinsics)] for name, its in seen.items()}
     yield PhotoStep(Progress(total - 1, total, "The table that they lie on"), tuple(found))

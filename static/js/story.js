@@ -164,6 +164,12 @@ async function runLive() {
   }
 }
 
+/** Shows where photos are worked on, while the page asks for one. */
+function usePhoto() {
+  closeStory();
+  showTab("photo");
+}
+
 function moveLamp() {
   closeStory();
   showTab("drive");
@@ -176,7 +182,7 @@ const hasOtherPlans = () => LIVE.has(known("episode")?.state) || Boolean(known("
 export async function setUpStory() {
   const run = byId("story-run");
   run.addEventListener("click", () => act(run, runLive));
-  byId("story-photo").addEventListener("click", closeStory); // the page then asks for the photo
+  byId("story-photo").addEventListener("click", usePhoto);
   byId("story-lamp").addEventListener("click", moveLamp);
   byId("story-close").addEventListener("click", closeStory);
   byId("story-again").addEventListener("click", () => {
