@@ -85,6 +85,7 @@ async function send() {
   const type = /\.zip$/i.test(chosen.name) ? "application/zip" : "model/gltf-binary";
   try {
     showJob(await upload(`objects?${query}`, chosen, (share) => { bar.value = share; }, type));
+    scrollTo(byId("object-work")); // where the work is told, and then the next step
     tell("");
   } finally {
     bar.hidden = true;
