@@ -49,7 +49,8 @@ _DESCRIPTION = (
 
 _ROUTERS = (
     status.router, status.storage_router, objects.router, fields.router, scenes.router, scenes.neural_router,
-    page.presets_router, page.stories_router, goals.router, photos.router, photos.calibration_router, episodes.router,
+    page.presets_router, page.stories_router, goals.router, photos.router, photos.pictures_router,
+    photos.calibration_router, episodes.router,
     estimates.router, predictions.router, jobs.router, events.router,
 )  # fmt: skip
 _OPEN_ROUTERS = (page.driver_router, page.views_router, robot.router, relay.router)  # of one page, or for anybody
@@ -127,7 +128,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 def _body_limit(settings: Settings, path: str) -> int:
     """How large a request to a path may be [bytes]: only uploads and many sequences of actions are large."""
     path = path.rstrip("/")
-    if path in (goals.UPLOAD_PATH, photos.UPLOAD_PATH, photos.CALIBRATION_UPLOAD_PATH):
+    if path in (goals.UPLOAD_PATH, photos.UPLOAD_PATH, photos.PICTURES_UPLOAD_PATH, photos.CALIBRATION_UPLOAD_PATH):
         return max(settings.max_photo_bytes, settings.max_body_bytes)
     if path in (objects.UPLOAD_PATH, fields.UPLOAD_PATH, estimates.UPLOAD_PATH):
         return settings.max_upload_bytes

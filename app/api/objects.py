@@ -75,7 +75,9 @@ async def add(
     request: Request,
     response: Response,
     name: Annotated[ObjectName, Query(description="What scenes call it.")],
-    mass_kg: Annotated[float, Query(ge=0.0001, le=MAX_MASS_KG, description="Mass [kg].")],
+    mass_kg: Annotated[
+        float | None, Query(ge=0.0001, le=MAX_MASS_KG, description="Mass [kg]; guessed from the volume if left out.")
+    ] = None,
     label: Annotated[Label, Query(description="Name for a person; from the name if empty.")] = "",
     scale: Annotated[
         float, Query(ge=1e-6, le=1e6, description="Metres for one unit of the file, such as 0.001 for millimetres.")

@@ -190,7 +190,7 @@ class PhotoFacts(BaseModel):
     width: int = Field(description="[px]")
     height: int = Field(description="[px]")
     focal_px: float = Field(description="In pixels of the photo as it was sent.")
-    focal_source: CameraSource = Field(description="Where it comes from: the board, the user, the file, or nowhere.")
+    focal_source: CameraSource = Field(description="The board, the user, the file, how objects stand, or nothing.")
     on_board: bool = Field(description="Whether the printed board is in view.")
 
 
@@ -224,6 +224,13 @@ class GoalMadeOut(TableMadeOut):
     """A goal that was made of a photo, and the table that it is for."""
 
     goal: GoalOut
+
+
+class PictureOut(BaseModel):
+    """What became of a picture: one of both."""
+
+    goal: GoalOut | None = Field(description="It is one of the goal camera.")
+    photo: TablePhotoOut | None = Field(description="It is a photograph, in which objects can be marked and found.")
 
 
 def _facts(photo: TablePhoto) -> PhotoFacts:
@@ -268,6 +275,10 @@ def _lists(points: Points) -> list[list[float]]:
 UPLOAD_PATH = "/api/photos"
 _PHOTO_BODY = upload("image/*", description="A photo.")
 router = APIRouter(prefix=UPLOAD_PATH, tags=["photos"], responses=problems(), route_class=BoundedRoute)
+PICTURES_UPLOAD_PATH = "/api/pictures"
+pictures_router = APIRouter(
+    prefix=PICTURES_UPLOAD_PATH, tags=["photos"], responses=problems(), route_class=BoundedRoute
+)
 ObjectPath = Annotated[Identifier, Path(description="Name of an object.", examples=["025_mug"])]
 
 
@@ -308,6 +319,15 @@ async def create(
     photo = await run_in_threadpool(services.photos.receive, data, name, focal_px)
     response.headers["Location"] = f"{UPLOAD_PATH}/{photo.id}"
     return _out(services, photo)
+
+
+@pictures_router.post("", status_code=201, responses=problems(409, 415, 503, 507), openapi_extra=_PHOTO_BODY)
+async def create_picture(
+    services: ServicesDep, request: Request, name: Annotated[DisplayName, Query(description="For people.")] = "Photo"
+) -> PictureOut:
+    """Keep a picture as what it is: a goal if it is one of the goal camera, else a photo of a table."""
+    data = await _photo_body(request, services.settings.max_photo_bytes)
+    return await services.slow_lane.run(_kept, services, data, name)
 
 
 @router.get("")
@@ -415,13 +435,20 @@ def drawing(services: ServicesDep, photo: PhotoDep) -> Response:
     return Response(png, media_type="image/png", headers={"Cache-Control": "no-store"})
 
 
+def _kept(services: Services, data: bytes, name: str) -> PictureOut:
+    picture = services.goals.read(data)
+    if services.goal_checks.is_goal_view(picture):
+        return PictureOut(goal=GoalOut.of(services.goals.receive_read(picture, name)), photo=None)
+    return PictureOut(goal=None, photo=_out(services, services.photos.receive(data, name)))
+
+
 def _out(services: Services, photo: TablePhoto) -> TablePhotoOut:
     job = services.photos.job(photo)
     found = services.photos.found(photo) if job is not None and job.state == "done" else None
     by_name = {} if job is None or found is None else {one.name: _found(job, one) for one in found.objects}
     labels = services.objects.labels()
     return TablePhotoOut(
-        **_facts(photo).model_dump(),
+        **_facts(photo if found is None else photo.as_found(found)).model_dump(),
         notes=list(photo.notes) if found is None else found.notes,
         objects=[_marked(one, labels.get(one.name, one.name), by_name.get(one.name)) for one in photo.objects],
         job=None if job is None else JobOut.of(job),

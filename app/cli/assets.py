@@ -79,8 +79,8 @@ class AssetsAdd(DataCommand):
     """OBJ, GLB or PLY file, in metres."""
     name: str
     """What scenes call it: lower-case letters, digits, '_' and '-'."""
-    mass: float
-    """Mass [kg]."""
+    mass: float | None = None
+    """Mass [kg]; guessed from the volume if it is not given."""
     label: str = ""
     """Name for a person; made from the name if not given."""
     scale: float = 1.0
@@ -99,7 +99,7 @@ class AssetsAdd(DataCommand):
         asset = add_object(self.mesh, new, library, force=self.force)
         row = {**_row(library, self.name), "collision_parts": len(asset.parts)}
         size = _size_text(row["size_m"])
-        self.say(f"Added {self.name}: {size} cm, {self.mass:g} kg, {len(asset.parts)} collision parts.")
+        self.say(f"Added {self.name}: {size} cm, {asset.info.mass_kg:g} kg, {len(asset.parts)} collision parts.")
         return row
 
 

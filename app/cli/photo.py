@@ -13,7 +13,7 @@ import tyro
 
 from app.cli.command import Command, DataCommand, check_out, choice_of, last_of
 from osfcore.errors import InvalidInput, UnknownName, shown
-from osfcore.io.files import write_atomically, write_json
+from osfcore.io.files import write_atomically, write_json, writing
 from osfcore.io.json_codec import encode
 from osfcore.photo import calibration
 from osfcore.photo.board import Board, board_pdf
@@ -122,11 +122,13 @@ class PhotoEstimate(DataCommand):
         from osfcore.photo.poses import PhotoConfig, PhotoModels, estimate_photo
         from osfcore.photo.summary import summarised
 
-        photos, starts, notes = self._inputs(self.trained.names())
+        photos, starts, notes, focal_known = self._inputs(self.trained.names())
         names = tuple(dict.fromkeys(name for photo in photos for name in photo.masks))
         models = PhotoModels({name: self.trained.load(name) for name in names})
         rng = stream_rng(self.seed, Stream.PHOTO_SEARCH)
-        last = last_of(estimate_photo(models, photos, names, rng, PhotoConfig(starts)))
+        config = PhotoConfig(starts, focal_known=focal_known)
+        last = last_of(estimate_photo(models, photos, names, rng, config))
+        photos = tuple(map(last.as_seen, photos))
         result = encode(summarised(photos, last, models, notes))
         write_json(self.out, result)
         if self.images is not None:
@@ -134,14 +136,15 @@ class PhotoEstimate(DataCommand):
         self.say(*_summary(result), f"Wrote {self.out}.")
         return result
 
-    def _inputs(self, known: Collection[str]) -> tuple[tuple[Photograph, ...], dict[str, Pose], tuple[str, ...]]:
+    def _inputs(self, known: Collection[str]) -> tuple[tuple[Photograph, ...], dict[str, Pose], tuple[str, ...], bool]:
         """Read everything, cheap checks first.
 
         Args:
             known: names of objects that can be found.
 
         Returns:
-            The photographs with cameras and masks, poses in the world to begin with, and sentences for people.
+            The photographs with cameras and masks, poses in the world to begin with, sentences for people, and
+            whether focal lengths are more than guesses.
 
         Raises:
             OsfError: with a sentence that says what is wrong.
@@ -162,7 +165,7 @@ class PhotoEstimate(DataCommand):
         choice = PoseChoice(image, self.scene_id, self.pose_source, self.pose_frame)
         poses = {} if self.poses is None else read_poses(self.poses, choice)
         masks = [self._masks(known, raw, boxes[number], number) for number, raw in enumerate(raws)]
-        photos, notes = [], []
+        photos, notes, focal_known = [], [], True
         for path, raw, its in zip(self.photo, raws, masks, strict=True):
             found = locate(raw, self.focal) if camera is None else locate_calibrated(raw, camera)
             if found.T_world_camera is None and len(raws) > 1:
@@ -170,6 +173,7 @@ class PhotoEstimate(DataCommand):
                 raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed)
             straight = {name: found.straightened(mask) for name, mask in its.items()}
             photos.append(to_photograph(found.raw, found.intrinsics, found.T_world_camera, straight))
+            focal_known = focal_known and found.source != "assumed"
             notes += found.notes if len(raws) == 1 else [f"{path.name}: {note}" for note in found.notes]
         names = {name for its in masks for name in its}
         starts = {name: photos[0].T_world_camera @ pose for name, pose in poses.items() if name in names}
@@ -179,7 +183,7 @@ class PhotoEstimate(DataCommand):
                 notes.append(f"Poses of {unused} were not used: nothing says which pixels show them.")
             if missing:
                 notes.append(f"{missing} had no pose to begin with; all orientations were tried.")
-        return tuple(photos), starts, tuple(notes)
+        return tuple(photos), starts, tuple(notes), focal_known
 
     def _check_counts(self) -> None:
         count = len(self.photo)
@@ -257,4 +261,22 @@ def _summary(result: dict[str, Any]) -> Iterator[str]:
     yield from result["notes"]
 
 
-Photo = choice_of(board=PhotoBoard, calibrate=PhotoCalibrate, estimate=PhotoEstimate)
+@dataclass(frozen=True)
+class PhotoSample(DataCommand):
+    """Draw the sample photo that the page offers, from scans, with a box around each object beside it."""
+
+    out: Path
+    """Folder to write table.jpg and table.json to; made if it does not exist."""
+
+    def run(self) -> dict[str, Any]:
+        """Draw and write it."""
+        from osfcore.experiments.sample_photo import BOXES, PHOTO, write_sample_photo
+
+        with writing(self.out):
+            self.out.mkdir(parents=True, exist_ok=True)
+            write_sample_photo(self.assets, self.out)
+        self.say(f"Wrote {self.out / PHOTO} and {self.out / BOXES}.")
+        return {"photo": str(self.out / PHOTO), "boxes": str(self.out / BOXES)}
+
+
+Photo = choice_of(board=PhotoBoard, calibrate=PhotoCalibrate, estimate=PhotoEstimate, sample=PhotoSample)

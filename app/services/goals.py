@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from app.processes.client import ProcessClient, ProcessUnavailable
-from app.processes.messages.neural_messages import CheckPhoto
+from app.processes.messages.neural_messages import CheckPhoto, RecogniseTable
 from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.runner import Runner
@@ -133,7 +133,19 @@ class Goals(GoalStore):
             TooManyGoals: if there are too many.
             StorageFull, CannotStore: if nothing more may be written, or the disk is full.
         """
-        photo = self._photos.read(data)
+        return self.receive_read(self.read(data), name, camera)
+
+    def read(self, data: bytes) -> Photo:
+        """A picture in any usual format, decoded.
+
+        Raises:
+            PhotoRefused: if it cannot be used.
+            ProcessUnavailable: if what decodes it died.
+        """
+        return self._photos.read(data)
+
+    def receive_read(self, photo: Photo, name: str, camera: Camera | None = None) -> GoalRecord:
+        """Keep a photo that has been decoded, as `receive` does."""
         camera = camera or goal_camera()
         crop = central_crop(photo.width, photo.height, camera)
         pixels = cut_out(photo, crop, camera)
@@ -334,7 +346,7 @@ _TEXTS: dict[Verdict, str] = {
     "shown": "",
     "doubtful": "It is not certain that this photo shows {objects}.",
     "bare": "Nothing can be seen on the table in this photo; choose one that shows {objects}.",
-    "elsewhere": "This photo does not show the table as the goal camera sees it; crop it, or choose another one.",
+    "elsewhere": "This photo does not show the table as the goal camera sees it; mark the objects in it, or crop it.",
     "others": "This photo does not seem to show {objects}; choose another one, or a table with what it shows.",
 }
 
@@ -402,6 +414,19 @@ class GoalChecks:
             raise MissingFields(missing)
         verdict = self._content(record, table).verdict
         return GoalCheck(verdict, _TEXTS[verdict].format(objects=self._listed(table.state.names)))
+
+    def is_goal_view(self, photo: Photo) -> bool:
+        """Whether the middle of a picture shows the table as the goal camera sees it, from whatever it holds.
+
+        Raises:
+            ProcessUnavailable: if what looks at photos has died.
+        """
+        camera = goal_camera()
+        pixels = cut_out(photo, central_crop(photo.width, photo.height, camera), camera)
+        seen_by = camera.resized(pixels.shape[1], pixels.shape[0])
+        answer = self._link.call(RecogniseTable(uuid.uuid4().hex, seen_by, _encoded(pixels, "PNG")))
+        assert isinstance(answer, bool)
+        return answer
 
     def require(self, goal: str, scene: str) -> None:
         """Refuse a goal that makes no sense for a table.

@@ -331,7 +331,8 @@ def _is_same(one: TablePhoto, other: TablePhoto) -> bool:
 
 def _order(photo: TablePhoto) -> PhotoInput:
     T = None if photo.T_world_camera is None else photo.T_world_camera.matrix().tolist()
-    return PhotoInput(K=photo.K.tolist(), T_world_camera=T, names=[entry.name for entry in photo.objects])
+    names, focal_known = [entry.name for entry in photo.objects], photo.source != "assumed"
+    return PhotoInput(K=photo.K.tolist(), T_world_camera=T, names=names, focal_known=focal_known)
 
 
 # What becomes of a photographed table: a table of the simulation, or a goal of one; and how it looks when drawn
@@ -421,7 +422,7 @@ class PhotoTables:
         found = self._photos.found(record)
         home = self._home(scene, {each.name for each in found.objects})
         layout = self._layout(record, None if home is None else home.id, despite_doubts=despite_doubts)
-        camera = record.camera(layout.T_table_camera, GOAL_SIDE)
+        camera = record.as_found(found).camera(layout.T_table_camera, GOAL_SIDE)
         png = self._reduced(record, camera)
         table = home or self._elsewhere(layout)
         try:
@@ -444,9 +445,10 @@ class PhotoTables:
             ProcessUnavailable: if what renders died.
         """
         record = self._photos.get(photo)
-        layout = layout_of(self._photos.found(record), _choices(record))
+        found = self._photos.found(record)
+        layout = layout_of(found, _choices(record))
         state = SceneState(tuple(layout.poses), Pose.stacked(layout.poses.values()), layout.light, None)
-        camera = record.camera(layout.T_table_camera, _DRAWN_SIDE)
+        camera = record.as_found(found).camera(layout.T_table_camera, _DRAWN_SIDE)
         masks = tuple(self._photos.read(self._photos.mask(photo, entry.name), photo) for entry in record.objects)
         picture = self._photos.read(self._photos.picture(photo), photo)
         return self._link.call(DrawPhoto(uuid.uuid4().hex, state, camera, picture, masks))

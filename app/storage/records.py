@@ -32,6 +32,7 @@ from osfcore.geometry.poses import Pose, unit_quaternion
 from osfcore.io.files import folder_at_once, is_file_name, put_in_place, read_json, reading_png, remove_folder
 from osfcore.io.json_codec import Entry, Matrix3, Text, Vector3, Vector4, decode, encode
 from osfcore.io.scene_file import CameraJson, ObjectJson
+from osfcore.photo.found_scene import FoundScene
 
 Poses = tuple[tuple[str, Pose], ...]
 Files = Mapping[str, bytes | None]  # of a record by name; None for one that is not there
@@ -466,6 +467,11 @@ class TablePhoto:
         else:
             kept = (*self.objects, changed)
         return replace(self, objects=kept)
+
+    def as_found(self, found: FoundScene) -> TablePhoto:
+        """Return it with the focal length that its objects show, if that was unknown."""
+        K = np.array(found.camera.K)
+        return self if self.source != "assumed" or np.allclose(K, self.K) else replace(self, K=K, source="objects")
 
     def camera(self, T_world_camera: Pose, longest: int) -> Camera:
         """Return the camera that took the photo, in another frame and for a smaller picture.

@@ -24,6 +24,7 @@ from osfcore.geometry.poses import (
     rotate,
     rotation_angle,
 )
+from osfcore.photo.board import Intrinsics, camera_matrix
 from osfcore.photo.photograph import Photograph
 from osfcore.photo.pose_loss import (
     LossKind,
@@ -415,6 +416,98 @@ def _frame(right: np.ndarray, ahead: np.ndarray, up: np.ndarray, origin: np.ndar
     return Pose.from_matrix(matrix).inverse()
 
 
+# A focal length that nobody knows: the one at which objects explain the photograph best and stand on one table.
+#
+# Seen through a lens of another focal length each object fits its mask nearly as well, nearer or farther, and turned
+# with the ray that leads to it; but then objects in different places no longer agree on the vertical and the plane. For
+# each focal length f of a grid, with the table that the objects found there agree on, the cost is
+#
+#     S(f) = sum_k [ L_k(f) + w (height_k^2 / s_h^2 + tilt_k^2 / s_t^2) ],
+#
+# L_k the loss of `PoseLoss` after alignment, the rest as in `TablePrior`. A parabola in log f through the least cost
+# and its neighbours refines it.
+
+
+_FOCAL_FACTORS = tuple(1.25**k for k in range(-2, 6))  # of the one assumed: 100 to 28 degrees from corner to corner
+_ON_TABLE_WEIGHT = 1e-2  # w: alignment may end in another place at each f, so that losses jump by several hundredths
+_NOT_ON_TABLE = 10.0  # of an object where no table is found
+
+
+class _FocalSearch:
+    """Tries focal lengths; `photo` knows no table, and its focal length is a guess with which `found` was found."""
+
+    def __init__(
+        self, models: PhotoModels, photo: Photograph, found: Sequence[PhotoObject], config: PhotoConfig
+    ) -> None:
+        self._models, self._photo, self._found, self._config = models, photo, found, config
+        self._costs: dict[float, float] = {}
+
+    def try_out(self, focal: float) -> None:
+        """Find the cost of a focal length [px]."""
+        poses, losses = [], []
+        for one in self._found:
+            pose, loss = self._aligned(one, one.best.pose, focal)
+            poses.append(pose)
+            losses.append(loss)
+        priors = [self._models.table_prior(one.name) for one in self._found]
+        table = table_from_objects(priors, poses)
+        self._costs[focal] = sum(losses) + _NOT_ON_TABLE * len(poses)
+        if table is not None:
+            placed = [(table.T_world_camera @ pose)[None] for pose in poses]
+            off = sum(float(prior.penalties(pose)[0]) for prior, pose in zip(priors, placed, strict=True))
+            self._costs[focal] = sum(losses) + _ON_TABLE_WEIGHT * off
+
+    def best(self) -> float | None:
+        """Return the focal length of least cost [px]; None if that is at an end of the grid, or none has a table."""
+        focals = np.array(sorted(self._costs))
+        costs = np.array([self._costs[focal] for focal in focals])
+        k = int(np.argmin(costs))
+        if k in (0, len(costs) - 1) or costs[k] >= _NOT_ON_TABLE * len(self._found):
+            return None
+        left, middle, right = costs[k - 1 : k + 2]
+        shift = 0.5 * (left - right) / max(left - 2 * middle + right, 1e-9)
+        return float(focals[k] * (focals[k + 1] / focals[k]) ** np.clip(shift, -0.5, 0.5))
+
+    def moved(self, one: PhotoObject, focal: float) -> PhotoObject:
+        """Return an object with its poses as a camera of that focal length sees it, the best first."""
+        loss = self._loss(one, focal)
+        poses = Pose.stacked(self._aligned(one, each.pose, focal)[0] for each in (one.best, *one.rivals))
+        ready = _photo_poses(poses, loss)
+        losses = np.array([each.loss for each in ready])
+        best, *rivals = (ready[k] for k in distinct(poses, losses, _ALIGNED, _APART_DEG))
+        return replace(one, best=best, rivals=tuple(rivals), doubt=doubt_of(one.name, best, rivals, loss))
+
+    def _aligned(self, one: PhotoObject, pose: Pose, focal: float) -> tuple[Pose, float]:
+        K = self._photo.intrinsics
+        return align(self._loss(one, focal), seen_through(pose, K, _with_focal(K, focal)))
+
+    def _loss(self, one: PhotoObject, focal: float) -> PoseLoss:
+        photo = replace(self._photo, intrinsics=_with_focal(self._photo.intrinsics, focal))
+        windows = object_windows([photo], one.name, _FINE_SIDE)
+        return PoseLoss(windows, self._models.surfels(one.name, FINE_ACROSS), kind=self._config.loss)
+
+
+def _with_focal(K: Intrinsics, focal: float) -> Intrinsics:
+    return camera_matrix(focal, float(K[0, 2]), float(K[1, 2]))
+
+
+def seen_through(pose: Pose, before: Intrinsics, after: Intrinsics) -> Pose:
+    """Return the pose at which another lens shows an object as large, in the same place and from the same side.
+
+    Args:
+        pose: in the camera's frame.
+        before: K of the lens through which it is seen there.
+        after: K of the other.
+    """
+    ray = pose.position / pose.position[2]
+    other = np.linalg.solve(after, before @ ray)
+    lengths = np.linalg.norm(ray), np.linalg.norm(other)
+    half_turn = np.array([lengths[0] * lengths[1] + ray @ other, *np.cross(ray, other)])
+    # Across the ray a length shows as f / z, along the image's radius as f |ray| / z: their geometric mean is kept.
+    depth = pose.position[2] * after[0, 0] / before[0, 0] * np.sqrt(lengths[1] / lengths[0])
+    return Pose(depth * other, quaternion_multiply(half_turn / np.linalg.norm(half_turn), pose.quaternion))
+
+
 # The table's plane in a camera's frame, from points on it.
 
 
@@ -509,11 +602,17 @@ class PhotoStep:
         progress: how far the work is.
         found: objects so far, in the photographs' world.
         table: on which objects were found to lie, where no photograph shows a board; with the last step only.
+        intrinsics: K with the focal length at which they lie on it, if that was unknown [px]; with the last step only.
     """
 
     progress: Progress
     found: tuple[PhotoObject, ...]
     table: TableGuess | None = None
+    intrinsics: Intrinsics | None = None
+
+    def as_seen(self, photo: Photograph) -> Photograph:
+        """Return the photograph with the focal length that was found, if one was."""
+        return photo if self.intrinsics is None else replace(photo, intrinsics=self.intrinsics)
 
 
 # Why a pose in a photograph should not be trusted, in a sentence.
@@ -614,10 +713,12 @@ class PhotoConfig:
     Attributes:
         starts: poses in the world to begin with, by object name; objects without one are looked for in all rotations.
         loss: "all", or "iou" for the outline alone, as in the paper.
+        focal_known: whether the photograph's focal length is more than a guess.
     """
 
     starts: Mapping[str, Pose] = field(default_factory=dict)
     loss: LossKind = "all"
+    focal_known: bool = True
 
 
 class PhotoModels:
@@ -692,6 +793,19 @@ def estimate_photo(
     for done, number in enumerate(again, len(names)):
         yield PhotoStep(Progress(done, total, f"Looking for {names[number]} behind the others"), tuple(found))
         found[number], seen[names[number]] = _found_behind(models, photos, found, number, rng, config)
+    intrinsics = None
+    fitting = [one for one in found if fits_outline(one.best)]
+    if not (on_table[0] or config.focal_known) and len(fitting) >= _FEWEST_OBJECTS:
+        search, total = _FocalSearch(models, photos[0], fitting, config), total + len(_FOCAL_FACTORS)
+        for done, factor in enumerate(_FOCAL_FACTORS, len(names) + len(again)):
+            focal = factor * photos[0].intrinsics[0, 0]
+            yield PhotoStep(Progress(done, total, f"Trying a focal length of {focal:.0f} pixels"), tuple(found))
+            search.try_out(focal)
+        if (focal := search.best()) is not None:
+            intrinsics = _with_focal(photos[0].intrinsics, focal)
+            found = [search.moved(one, focal) for one in found]
+            photos = [replace(photos[0], intrinsics=intrinsics)]
+            seen = {name: [replace(its[0], intrinsics=intrinsics)] for name, its in seen.items()}
     yield PhotoStep(Progress(total - 1, total, "The table that they lie on"), tuple(found))
     table = None
     if not on_table[0]:
@@ -699,7 +813,7 @@ def estimate_photo(
         if table is not None:
             for k in table.supported:
                 found[k] = _on_table(models, seen[found[k].name][0], found[k], table, config)
-    yield PhotoStep(Progress(total, total, "All objects were looked for"), tuple(found), table)
+    yield PhotoStep(Progress(total, total, "All objects were looked for"), tuple(found), table, intrinsics)
 
 
 def _found_behind(

@@ -180,7 +180,7 @@ def guessed_intrinsics(raw: RawPhotograph) -> tuple[Intrinsics, str]:
         return intrinsics_from_focal(width, height, raw.focal_px), note
     focal = np.hypot(width, height) / 2 / np.tan(np.deg2rad(ASSUMED_DIAGONAL_DEG) / 2)
     phone = f"that of a phone's main camera is assumed ({ASSUMED_DIAGONAL_DEG:g} degrees from corner to corner)"
-    note = f"The photo does not say its focal length; {phone}, so distances may be off by a fifth."
+    note = f"The photo does not say its focal length; {phone}, unless two or more objects show another one."
     return intrinsics_from_focal(width, height, float(focal)), note
 
 

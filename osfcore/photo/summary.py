@@ -47,6 +47,11 @@ def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModel
         T_table_world, table = step.table.T_world_camera, "objects"
         seen = f"{len(step.table.supported)} objects lie, whose verticals differ by {step.table.spread_deg:.1f} degrees"
         notes.append(f"The table was found from how {seen}; it may be off by a few.")
+    if step.intrinsics is not None:
+        focal = f"{step.intrinsics[0, 0]:.0f} pixels"
+        notes.append(
+            f"The focal length, {focal}, is that at which the objects stand on one table; it may be off by a fifth."
+        )
     light = None
     try:
         light, unknown = _light(photos, step, models)

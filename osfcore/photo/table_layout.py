@@ -22,8 +22,8 @@ class NoPhotographedTable(OsfError):
 
     def __init__(self) -> None:
         super().__init__(
-            "The photo does not tell where the table is; mark a second object that stands on it, or photograph it with "
-            "the printed board in view."
+            "The photo does not tell where the table is: fewer than two of the marked objects stand on one plane. Mark "
+            "another one that stands on it, mend their outlines, or photograph it with the printed board in view."
         )
 
 

@@ -1,9 +1,7 @@
-// A goal image or a mesh may be dropped anywhere on the page: over the 3D view, too, whose frame would swallow it.
+// A picture or a mesh may be dropped anywhere on the page: over the 3D view, too, whose frame would swallow it.
 import { byId } from "./dom.js";
-import { uploadGoal } from "./goals.js";
-import { sendPhoto } from "./photo.js";
 import { isMesh, takeMesh } from "./own-object.js";
-import { showTab } from "./tabs.js";
+import { sendPicture } from "./picture.js";
 
 const AWAY_MS = 150; // a drag that is over the page tells so more often than this
 let timer = 0;
@@ -29,16 +27,8 @@ function drop(event) {
   show(false);
   const [file] = event.dataTransfer.files;
   if (!file) return;
-  if (isMesh(file)) {
-    takeMesh(file);
-    return;
-  }
-  if (!byId("panel-photo").hidden) {
-    sendPhoto(file);
-    return;
-  }
-  showTab("episode");
-  uploadGoal(file);
+  if (isMesh(file)) takeMesh(file);
+  else sendPicture(file);
 }
 
 function listenIn(target) {

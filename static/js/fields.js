@@ -3,6 +3,7 @@ import { get, getAll, post, remove, upload } from "./api.js";
 import { byId, el } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { LIVE, controls, psnrText, showJob, stateText, titleText } from "./jobs.js";
+import { nextStep, stepKey } from "./next-step.js";
 import { inWords, known, objects, set, watch } from "./state.js";
 import { scrollTo, showTab } from "./tabs.js";
 import { act, tellFailure, toast } from "./toasts.js";
@@ -168,18 +169,23 @@ function drawTraining(job) {
   byId("training").dataset.state = job.state;
   byId("training-title").textContent = `${label}${job.params.method === "paper" ? ", as published" : ""}`;
   byId("training-title").title = titleText(job);
-  byId("training-psnr").textContent = Number.isFinite(result.psnr_mask) ? psnrText(result) : "";
+  const soFar = LIVE.has(job.state) ? " so far, on a few unseen images" : "";
+  byId("training-psnr").textContent = Number.isFinite(result.psnr_mask) ? `${psnrText(result)}${soFar}` : "";
   byId("training-bar").hidden = !LIVE.has(job.state);
   byId("training-bar").value = job.total ? job.done / job.total : 0;
   // PSNR stands in the head already.
-  byId("training-state").textContent = job.state === "done" ? "done" : stateText(job).replace(/^.*dB.*, (?=.* left$)/, "");
+  byId("training-state").textContent = job.state === "done" ? "done, measured on all unseen images" : stateText(job).replace(/^.*dB.*, (?=.* left$)/, "");
   byId("training-error").textContent = inWords(job.error ?? "");
   byId("training-error").hidden = !job.error;
   const preview = result.previews && job.state !== "failed" && job.state !== "cancelled"
     ? `api/jobs/${job.id}/preview.png?v=${result.previews}` : "";
-  const key = `${job.state} ${job.files.join()}`;
+  const { name } = job.params;
+  const isUsable = job.state === "done" && objects().some((object) => object.name === name && object.available);
+  const key = `${job.state} ${job.files.join()} ${isUsable ? stepKey(name) : ""}`;
   shown = { id: job.id, state: job.state, controls: key, preview };
-  if (before.id !== job.id || before.controls !== key) byId("training-actions").replaceChildren(...controls(job));
+  if (before.id !== job.id || before.controls !== key) {
+    byId("training-actions").replaceChildren(...(isUsable ? [nextStep(name)] : []), ...controls(job));
+  }
   if (before.preview !== preview) drawPreview(preview);
   drawComparison(job, label);
   if (before.id === job.id && before.state !== job.state) tellEnd(job, label);
@@ -263,4 +269,5 @@ export function setUpFields() {
     refreshFields();
   });
   watch("training", drawTraining);
+  watch("scene", () => drawTraining(known("training")));
 }

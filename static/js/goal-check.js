@@ -34,7 +34,7 @@ function draw(check) {
   byId("goal-check").dataset.level = check?.refused ? "error" : isWrong ? "warning" : "info";
   byId("goal-check-text").textContent = check?.text ?? "";
   byId("goal-check-do").hidden = !isWrong;
-  byId("check-crop").hidden = !known("goal")?.photo;
+  byId("check-crop").hidden = byId("check-mark").hidden = !known("goal")?.photo;
   byId("check-table").hidden = !check?.scene;
   byId("check-photo").hidden = Boolean(check?.scene);
   byId("check-doubt").hidden = check?.verdict === "other table";

@@ -1,14 +1,12 @@
 // The goal: an image of how the table should look. Uploaded, drawn at random, composed, or one of the earlier ones.
-import { getAll, post, remove, upload } from "./api.js";
-import { openCrop } from "./crop.js";
-import { byId, el, whileDisabled } from "./dom.js";
+import { getAll, post, remove } from "./api.js";
+import { byId, el } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { mayDrive } from "./driver.js";
 import { current, known, set, watch } from "./state.js";
 import { act, tellFailure, tellMissingScene } from "./toasts.js";
 
 const DRAWN_SEEDS = 1_000_000; // short to read, and far fewer than may be asked for
-const NAME_MAX = 100;
 const CHOSEN = "osf-goal"; // what this page has chosen outlives a reload of it
 const remembered = JSON.parse(sessionStorage.getItem(CHOSEN) ?? "{}");
 let pickedFor = remembered.scene ?? null; // the scene for which a goal of another table was chosen by hand
@@ -48,22 +46,6 @@ export function randomGoal() {
   const seed = Math.floor(Math.random() * DRAWN_SEEDS);
   return act(byId("random-goal"), async () =>
     takeGoal(await post("goals", { scene: scene.id, random: { seed, moved: null }, name: `Random goal ${seed}` })));
-}
-
-/** Sends an image; what is wrong with it is the service's to say. */
-export async function uploadGoal(file) {
-  if (!mayDrive()) return;
-  const bar = byId("goal-bar");
-  byId("goal-card").open = true;
-  bar.hidden = false;
-  bar.value = 0;
-  await tellFailure(async () => {
-    const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
-    const goal = await upload(`goals?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
-    takeGoal(goal);
-    if (goal.photo.width !== goal.photo.height) openCrop(); // its middle is a guess
-  }, byId("upload-goal"));
-  bar.hidden = true;
 }
 
 // Drawing
@@ -107,14 +89,6 @@ function drawEarlier() {
 }
 
 export function setUpGoals() {
-  const file = byId("goal-file");
-  const upload = byId("upload-goal");
-  for (const button of [byId("goal-drop"), upload]) button.addEventListener("click", () => file.click());
-  file.addEventListener("change", () => {
-    const [chosen] = file.files;
-    if (chosen) whileDisabled(upload, () => uploadGoal(chosen));
-    file.value = "";
-  });
   byId("random-goal").addEventListener("click", randomGoal);
   byId("goal-select").addEventListener("change", (event) => {
     pickedFor = current()?.id ?? null;

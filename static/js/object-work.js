@@ -1,16 +1,19 @@
 // What is being done for the objects, where they are: fetching, or making one of a mesh; and what went wrong.
 import { byId } from "./dom.js";
 import { LIVE, controls, stateText, titleText } from "./jobs.js";
-import { refreshObjects, sizeText } from "./objects.js";
+import { nextStep, stepKey } from "./next-step.js";
+import { massText, refreshObjects, sizeText } from "./objects.js";
 import { clearMesh } from "./own-object.js";
-import { inWords, watch } from "./state.js";
+import { inWords, known, watch } from "./state.js";
 
 let followed = ""; // the job that was seen at work, whose end is told, too
 let drawn = "";
 
 function endText(job) {
   if (job.state !== "done" || job.kind !== "add_object") return stateText(job);
-  return `Ready: ${sizeText(job.result.size_m)}. It can be put on the table; to be recognised, it needs a field.`;
+  const { size_m: size, mass_kg: mass } = job.result;
+  const guessed = job.params.object.mass_kg === null ? ", guessed from its volume" : "";
+  return `Ready: ${sizeText(size)}, ${massText(mass)}${guessed}. It can be pushed at once; to be recognised, it needs a field.`;
 }
 
 function settle(job) {
@@ -30,13 +33,16 @@ function draw(job) {
   byId("object-work-state").textContent = endText(job);
   byId("object-work-error").textContent = inWords(job.error ?? "");
   byId("object-work-error").hidden = !job.error;
-  const key = `${job.id} ${job.state}`;
+  const isNew = job.state === "done" && job.kind === "add_object";
+  const key = `${job.id} ${job.state}${isNew ? stepKey(job.params.name) : ""}`;
   if (drawn === key) return;
-  byId("object-work-actions").replaceChildren(...controls(job));
+  const isSettled = drawn.startsWith(`${job.id} ${job.state}`);
+  byId("object-work-actions").replaceChildren(...(isNew ? [nextStep(job.params.name)] : []), ...controls(job));
   drawn = key;
-  settle(job);
+  if (!isSettled) settle(job);
 }
 
 export function setUpObjectWork() {
   watch("objectWork", draw);
+  for (const what of ["scene", "objects"]) watch(what, () => draw(known("objectWork")));
 }

@@ -4,18 +4,20 @@ import { byId, el } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { prepareTraining } from "./fields.js";
 import { showJob } from "./jobs.js";
-import { makeScene } from "./scenes.js";
-import { current, known, objects, set, watch } from "./state.js";
+import { putOnTable } from "./next-step.js";
+import { known, objects, set, watch } from "./state.js";
 import { scrollTo, showTab } from "./tabs.js";
-import { act, tellFailure, toast } from "./toasts.js";
+import { act, tellFailure } from "./toasts.js";
 
-const MOST_ON_TABLE = 8;
 const SIDE = 96; // of one view in a thumbnail [px]
 const VIEWS = 24;
 const SYMMETRY = { none: "", discrete: "discrete symmetry", continuous: "turns freely" };
 
 /** The sides of a box in metres, in words. */
 export const sizeText = (metres) => `${metres.map((side) => (100 * side).toFixed(1)).join(" × ")} cm`;
+
+/** A mass in kilograms, in words. */
+export const massText = (kg) => `${Number((1000 * kg).toPrecision(3))} g`;
 
 /** All views side by side, of which the style sheet shows one after the other. */
 function thumbnail(object) {
@@ -28,18 +30,9 @@ function thumbnail(object) {
 
 function facts(object) {
   const symmetry = el("span", { textContent: SYMMETRY[object.symmetry.kind], title: object.symmetry.reason });
-  const weight = `${Number((1000 * object.mass_kg).toPrecision(3))} g`;
+  const weight = massText(object.mass_kg);
   return el("span", { className: "hint" }, object.size_m ? `${sizeText(object.size_m)}, ` : "", weight,
     symmetry.textContent ? ", " : "", symmetry, object.available ? "" : ", not on this machine");
-}
-
-async function putOnTable(object) {
-  const there = current()?.objects.map(({ name }) => name) ?? [];
-  if (there.includes(object.name)) throw new Error(`${object.label} is on the table already.`);
-  if (there.length >= MOST_ON_TABLE) throw new Error(`${MOST_ON_TABLE} objects are on the table, which is the most.`);
-  const light = current() ? { light: { position: current().light.position } } : {};
-  await makeScene({ objects: [...there, object.name], seed: Math.floor(Math.random() * 2 ** 31), ...light });
-  toast(`${object.label} is on the table, in a scene of its own; the one before is kept under Scenes.`);
 }
 
 async function deleteObject(object) {
@@ -62,7 +55,7 @@ function fetchButton({ name, label }) {
 function actions(object) {
   const { label } = object;
   if (!object.available) return object.fetchable ? [fetchButton(object)] : [];
-  const buttons = [button("Put on the table", label, () => putOnTable(object))];
+  const buttons = [button("Put on the table", label, () => putOnTable(object.name))];
   if (!(known("fields") ?? []).some((field) => field.name === object.name)) {
     buttons.push(button("Train its field", label, () => prepareTraining(object.name)));
   }
@@ -103,8 +96,11 @@ function draw() {
   drawn = now;
   const there = objects().filter((object) => object.available).length;
   const missing = objects().some((object) => object.fetchable && !object.available);
-  byId("object-list").replaceChildren(...objects().map(entry));
+  const elsewhere = objects().filter((object) => !object.available && !object.fetchable);
+  byId("object-list").replaceChildren(...objects().filter((object) => !elsewhere.includes(object)).map(entry));
   byId("objects-hint").textContent = objects().length ? `${there} of ${objects().length} are on this machine.` : "";
+  byId("objects-elsewhere").hidden = !elsewhere.length;
+  byId("objects-elsewhere-list").textContent = elsewhere.map(({ label }) => label).join(", ");
   byId("fetch-objects").hidden = !missing;
 }
 

@@ -11,6 +11,7 @@ const LIKELY_M = [0.03, 0.6]; // longest side of most things on a table
 const MOST_NAME = 60;
 let chosen = null;
 let size = null; // in the file's unit, if it is known
+let suggested = ""; // the name that the file gave
 
 const form = () => byId("new-object");
 const scale = () => Number(form().elements.unit.value);
@@ -50,12 +51,13 @@ export async function takeMesh(file) {
   scrollTo(form().closest(".card"));
   chosen = file;
   byId("own-object-file-name").textContent = file.name;
-  if (!form().elements.label.value) form().elements.label.value = bareName(file.name).slice(0, MOST_NAME);
+  const { label } = form().elements;
+  if (!label.value || label.value === suggested) label.value = suggested = bareName(file.name).slice(0, MOST_NAME);
   size = await glbSize(file);
   if (chosen !== file) return;
   if (size) guessUnit();
   drawSize();
-  form().elements.grams.focus({ preventScroll: true });
+  form().querySelector("[type=submit]").focus({ preventScroll: true });
 }
 
 /** A name for scenes, made from that for people. */
@@ -73,9 +75,9 @@ async function send() {
   if (!chosen) throw new Error("Choose a file first: a GLB, or a zip of an OBJ with its MTL and texture.");
   const { label, grams } = form().elements;
   const query = new URLSearchParams({
-    name: nameFrom(label.value), label: label.value.trim(), mass_kg: Number(grams.value) / 1000, scale: scale(),
-    file_name: chosen.name.slice(-200),
+    name: nameFrom(label.value), label: label.value.trim(), scale: scale(), file_name: chosen.name.slice(-200),
   });
+  if (grams.value) query.set("mass_kg", Number(grams.value) / 1000);
   const bar = byId("own-object-bar");
   bar.hidden = false;
   bar.value = 0;
@@ -83,6 +85,7 @@ async function send() {
   const type = /\.zip$/i.test(chosen.name) ? "application/zip" : "model/gltf-binary";
   try {
     showJob(await upload(`objects?${query}`, chosen, (share) => { bar.value = share; }, type));
+    scrollTo(byId("object-work")); // where the work is told, and then the next step
     tell("");
   } finally {
     bar.hidden = true;
@@ -107,7 +110,7 @@ async function submit(event) {
 export function clearMesh(file) {
   if (chosen && chosen.name !== file) return;
   form().reset();
-  [chosen, size] = [null, null];
+  [chosen, size, suggested] = [null, null, ""];
   byId("own-object-file-name").textContent = "or drop it anywhere";
   tell("");
 }

@@ -8,7 +8,7 @@ import { LIVE, stateText } from "./jobs.js";
 import { drawMarks, setBrush, setBusy, setDrawing, setTool, setUpMarks, wipeTo } from "./photo-marks.js";
 import { refreshScenes } from "./scenes.js";
 import { inWords, known, labelOf, set, watch } from "./state.js";
-import { showTab } from "./tabs.js";
+import { scrollTo, showTab } from "./tabs.js";
 import { act, tellFailure, toast } from "./toasts.js";
 
 const NAME_MAX = 100;
@@ -120,16 +120,20 @@ function drawResult() {
 
 function drawJob(job) {
   const isLive = LIVE.has(job?.state);
+  const wasTold = !byId("photo-finding").hidden || !byId("photo-error").hidden;
   byId("photo-finding").hidden = !isLive;
   byId("photo-finding-bar").value = job?.total ? job.done / job.total : 0;
   byId("photo-finding-state").textContent = isLive ? inWords(stateText(job)) : "";
   byId("photo-error").hidden = job?.state !== "failed";
   byId("photo-error").textContent = inWords(job?.error ?? "");
+  const told = isLive ? byId("photo-finding") : byId("photo-error");
+  if (!wasTold && !told.hidden) told.scrollIntoView({ block: "nearest" });
   byId("find-objects").disabled = isLive || !photo?.objects.length;
 }
 
 function show(next) {
   photo = next;
+  set("photo", photo);
   if (photo) sessionStorage.setItem(CHOSEN, photo.id);
   byId("photo-card").hidden = !photo;
   drawMarks(photo, chosen);
@@ -164,8 +168,15 @@ function drawStage() {
 
 // Doing
 
-/** Sends a photo of a table and shows it. */
-export async function sendPhoto(file) {
+/** Shows a photo that has just been sent, and what to do with it. */
+export async function showPhoto(id) {
+  await refreshPhotos();
+  await open(id);
+  showTab("photo");
+  scrollTo(byId("photo-card"));
+}
+
+async function sendPhoto(file) {
   if (!mayDrive()) return;
   const bar = byId("table-photo-bar");
   bar.hidden = false;
@@ -173,8 +184,7 @@ export async function sendPhoto(file) {
   await tellFailure(async () => {
     const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
     const sent = await upload(`photos?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
-    await refreshPhotos();
-    await open(sent.id);
+    await showPhoto(sent.id);
   }, byId("upload-table-photo"));
   bar.hidden = true;
 }
@@ -231,7 +241,8 @@ function inTurn(work) {
   };
 }
 
-async function find() {
+/** Begins the search for what is marked. */
+export async function findObjects() {
   const together = [...byId("photo-together").querySelectorAll("input:checked")].map(({ value }) => value);
   show(await post(path("/find"), { together, seed: 0 }));
 }
@@ -292,7 +303,7 @@ export function setUpPhoto() {
   for (const radio of document.getElementsByName("photo-tool")) radio.addEventListener("change", () => chooseTool(radio.value));
   byId("photo-brush").addEventListener("input", ({ target }) => setBrush(Number(target.value)));
   byId("find-objects").addEventListener("click", async () => {
-    await act(byId("find-objects"), find);
+    await act(byId("find-objects"), findObjects);
     drawJob(photo?.job);
   });
   byId("photo-undo").addEventListener("click", () => act(byId("photo-undo"), async () => {
@@ -318,6 +329,7 @@ export function setUpPhoto() {
     return tellFailure(async () => {
       show(await get(path()));
       if (isFound() && photo.table) wipeTo(50);
+      if (isFound()) byId("photo-result").scrollIntoView({ block: "nearest" });
     });
   });
 }

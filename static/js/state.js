@@ -3,7 +3,7 @@
 // The scene is undefined until the service has told, and null when there is none.
 // `training` is the job that trains a field now, or the latest one that did; `estimate` and `episode` likewise,
 // `objectWork` the one that fetches or makes objects, `clip` the one that makes a clip, `photoJob` the one
-// that looks at a photo of a table.
+// that looks at a photo of a table, `photo` the one that is marked on this page, null if there is none.
 // `camera` is the calibrated one that was saved on this page, null if there is none.
 // `goal` is the one that was chosen on this page; `draft` the one that is being composed, null when there is none.
 // `check` is what the service says of the goal and the table, null while it says nothing.
@@ -14,7 +14,7 @@
 // its cameras saw last, by name.
 const state = {
   scene: undefined, objects: [], fields: undefined, training: undefined, estimate: undefined, episode: undefined,
-  objectWork: undefined, clip: undefined, photoJob: undefined,
+  objectWork: undefined, clip: undefined, photoJob: undefined, photo: null,
   camera: null, goals: [], goal: null, check: null, draft: null, driver: null, opened: null, report: null, settings: null,
   recorded: false, robot: undefined, robotPictures: {},
 };

@@ -33,7 +33,9 @@ function tell(error, near) {
   const isSeen = near?.checkVisibility?.() && !near.closest("fieldset:disabled");
   const node = isSeen ? el("p", { className: "error beside-cause", textContent: inWords(error.message), attributes: { role: "alert" } }) : toast(error.message, "error");
   node.dataset.failed = error.status ?? -1;
-  if (isSeen) (near.closest(GROUPS) ?? near).after(node);
+  if (!isSeen) return;
+  (near.closest(GROUPS) ?? near).after(node);
+  node.scrollIntoView({ block: "nearest" });
 }
 
 /** Runs an action; a failure is told beside what caused it, `near`, until it is tried again, or else in the corner. */

@@ -47,25 +47,38 @@ def choose(page, sides, name="Tall box.glb"):
     wait_until(lambda: page.inner_text("#own-object-state") != "", 10)
 
 
-def test_a_mesh_in_millimetres_is_sized_added_drawn_put_on_the_table_and_led_on_to_training(page, url):
+def test_a_mesh_in_millimetres_is_sized_weighed_added_put_on_the_table_pushed_and_led_on_to_training(page, url):
+    choose(page, (100.0, 100.0, 100.0), "Cube.glb")
     choose(page, (60.0, 100.0, 80.0))
     assert page.input_value("#new-object [name=unit]") == "0.001"  # guessed: nothing here is 100 m long
     assert "6.0 × 8.0 × 10.0 cm" in page.inner_text("#own-object-state")
     assert page.input_value("#new-object [name=label]") == "Tall box"
-    page.fill("#new-object [name=grams]", "150")
     page.click("#new-object [type=submit]")
-    wait_until(lambda: page.inner_text("#object-work-state").startswith("Ready: 6.0 × 8.0 × 10.0 cm"), WORK_S)
+    ready = "Ready: 6.0 × 8.0 × 10.0 cm, 240 g, guessed"
+    wait_until(lambda: page.inner_text("#object-work-state").startswith(ready), WORK_S)
     tile = page.locator('[data-object="tall_box"]')
     tile.wait_for(timeout=WAIT_MS)
     tile.scroll_into_view_if_needed()
     wait_until(lambda: page.evaluate(IS_DRAWN, "tall_box"), WORK_S)
-    assert "150 g" in tile.inner_text()
-    tile.get_by_text("Put on the table").click()
+    assert "240 g" in tile.inner_text()
+    page.get_by_role("button", name="Put it on the table: Tall box").click()
     wait_until(lambda: "Tall box" in page.inner_text("#toasts"), WORK_S)
     with urllib.request.urlopen(f"{url}/api/scenes", timeout=20) as answer:
         listed = json.load(answer)
     shown = next(scene for scene in listed["scenes"] if scene["id"] == listed["current"])
     assert "tall_box" in [entry["name"] for entry in shown["objects"]]
+    push = page.get_by_role("button", name="Push it: Tall box")
+    push.wait_for(timeout=WAIT_MS)
+    push.click()
+    before = shown["time_s"]
+    page.keyboard.press("Enter")  # the first button of the pad has the focus
+
+    def scene():
+        with urllib.request.urlopen(f"{url}/api/scenes/{shown['id']}", timeout=20) as answer:
+            return json.load(answer)
+
+    wait_until(lambda: scene()["time_s"] > before, WORK_S)
+    page.click("#tab-objects")
     tile.get_by_text("Train its field").click()
     assert page.is_visible("#new-field")
     assert page.input_value("#new-field [name=mesh]") == "tall_box"

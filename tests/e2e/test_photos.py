@@ -1,4 +1,4 @@
-"""A photo as people take them, of any format and shape, is cropped on the page; one of something else is refused."""
+"""A picture of any format and shape goes the way of what it is: a goal, or a photograph, which can still be cropped."""
 
 import io
 import shutil
@@ -52,11 +52,12 @@ def page(browser, port, goals):
     page.close()
 
 
-def send(page, image, name, kind):
+def send(page, image, name, kind, shown_in="goal-name"):
     data = io.BytesIO()
     image.save(data, kind, quality=95)
     page.set_input_files("#goal-file", {"name": name, "mimeType": "", "buffer": data.getvalue()})
-    page.wait_for_function("name => document.getElementById('goal-name').textContent === name", arg=name)
+    shown = "([id, name]) => document.getElementById(id).textContent === name"
+    page.wait_for_function(shown, arg=[shown_in, name], timeout=WAIT_MS)
 
 
 def told(page):
@@ -65,12 +66,14 @@ def told(page):
     return page.inner_text("#goal-check-text")
 
 
-def test_a_wide_photo_of_an_iphone_is_cropped_to_the_table(page, port, goals):
+def test_a_wide_photo_of_an_iphone_is_a_photograph_and_is_cropped_to_the_table_on_request(page, port, goals):
     register_heif_opener()
-    side = 1024
+    side = 800
     photo = Image.new("RGB", (side + 4 * BORDER, side + BORDER), (200, 190, 180))
     photo.paste(goals["table"].resize((side, side), Image.Resampling.BICUBIC), (3 * BORDER, BORDER))
-    send(page, photo, "IMG_0001.HEIC", "HEIF")
+    send(page, photo, "IMG_0001.HEIC", "HEIF", "photo-name")
+    assert page.is_visible("#photo-stage")
+    page.click("#photo-crop")
     page.wait_for_selector("#cropping:not([hidden])", timeout=WAIT_MS)
     assert f"of the photo's {photo.width} × {photo.height} px" in page.inner_text("#crop-told")
     page.eval_on_selector("#crop-zoom", "range => { range.value = 30; range.dispatchEvent(new Event('input')); }")
@@ -108,6 +111,25 @@ def test_other_objects_are_refused_or_doubted_beside_the_photo(page, goals):
     assert "the cracker box and the mustard bottle" in told(page)
     assert page.is_visible("#check-photo")
     assert page.is_visible("#despite-doubts")
+
+
+def test_what_is_wrong_with_a_picture_is_told_in_view_beside_what_was_pressed(page):
+    page.set_input_files("#goal-file", {"name": "notes.txt", "mimeType": "", "buffer": b"a text"})
+    told = page.locator("#goal-card .beside-cause")
+    told.wait_for(timeout=WAIT_MS)
+    assert "no picture that can be read" in told.inner_text()
+    bounds = told.bounding_box()
+    assert bounds["y"] >= 0
+    assert bounds["y"] + bounds["height"] <= 900
+
+
+def test_objects_are_marked_in_a_goal_that_does_not_suit_the_table(page, goals):
+    send(page, goals["other"], "soup.png", "PNG")
+    told(page)
+    page.click("#check-mark")
+    page.wait_for_selector("#photo-card:not([hidden])", timeout=WAIT_MS)
+    assert page.inner_text("#photo-name") == "soup.png"
+    assert page.is_visible("#photo-stage")
 
 
 def test_the_goal_of_another_table_offers_that_table(page, port):

@@ -123,6 +123,17 @@ def test_a_photo_becomes_the_goal(page, port, scene, photo, boxes):
     assert call(port, "GET", "goals")["goals"][0]["scene"] == scene["id"], "the table on view holds these objects"
 
 
+def test_a_sample_photo_is_sent_marked_and_looked_at_with_one_click(page, port):
+    page.click("#sample-photo")
+    page.wait_for_selector("#photo-finding:not([hidden])", timeout=WAIT_MS)
+    photo = latest(port)
+    assert len(photo["objects"]) == page.locator("#photo-objects li").count() >= 2
+    assert photo["focal_source"] == "file"
+    assert photo["job"]["kind"] == "photo"
+    page.click("#cancel-finding")
+    page.wait_for_selector("#photo-finding", state="hidden", timeout=WAIT_MS)
+
+
 def test_clicks_and_strokes_mend_an_outline_and_it_can_be_taken_back(page, port, photo, boxes):
     send(page, photo, "mend.jpg")
     name = TABLE[0]

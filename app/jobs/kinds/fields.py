@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from jaxtyping import UInt8
 from pydantic import Field, model_validator
 
 from app.jobs.job import Job
@@ -21,10 +23,11 @@ from app.jobs.kind import JobKind
 from app.jobs.params import Identifier, ImageCount, JobParams, ObjectName, Seed
 from app.storage.field_files import clear_workshop, install, install_published, open_workshop
 from osfcore.errors import CorruptFile
+from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldLibrary
 from osfcore.fields.kiloosf import read_field
 from osfcore.io.files import write_atomically, writing
-from osfcore.io.image_file import write_png
+from osfcore.io.image_file import to_uint8, write_png
 from osfcore.paper.method import Method, own_field_path
 from osfcore.progress import Progress
 
@@ -216,7 +219,7 @@ def _train(
     previews = 0
     for step in steps:
         if step.preview is not None:
-            write_png(preview, step.preview)
+            write_png(preview, _for_eyes(step.preview))
             previews += 1
         share = step.progress.done / max(step.progress.total, 1)  # of training; before it is carved, after it measured
         yield replace(
@@ -227,6 +230,14 @@ def _train(
             psnr_mask=step.psnr_mask,
             previews=previews,
         )
+
+
+def _for_eyes(strip: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Truth, rendering and difference with the first two as screens expect them: radiance itself looks nearly black."""
+    encoded = to_uint8(srgb_of_linear(np.arange(256) / 255))
+    shown, pictures = strip.copy(), 2 * strip.shape[1] // 3
+    shown[:, :pictures] = encoded[strip[:, :pictures]]
+    return shown
 
 
 def _offer(shop: Path, folder: Path, name: str) -> None:

@@ -39,11 +39,13 @@ class AddingStep(Progress):
         name: of the object.
         size_m: extents of its bounding box [m]; None until it has been measured.
         faces: its number of triangles; None until then.
+        mass_kg: as stated, or as guessed [kg]; None until then.
     """
 
     name: str
     size_m: tuple[float, ...] | None = None
     faces: int | None = None
+    mass_kg: float | None = None
 
 
 class AddObjectParams(JobParams):
@@ -84,13 +86,15 @@ def _added(new: NewObject, file_name: str, place: JobContext) -> Iterator[Adding
     mesh = read_mesh(mesh_file, new.scale, inputs / "unpacked")
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     size = tuple(round(float(side), 6) for side in high - low)
-    yield AddingStep(2, _STEPS, "Making collision shapes and resting orientations", new.name, size, len(mesh.faces))
-    asset = make_asset(mesh, new.info)
-    yield AddingStep(3, _STEPS, "Storing the object", new.name, size, len(mesh.faces))
+    info = new.info(mesh)
+    measured = new.name, size, len(mesh.faces), info.mass_kg
+    yield AddingStep(2, _STEPS, "Making collision shapes and resting orientations", *measured)
+    asset = make_asset(mesh, info)
+    yield AddingStep(3, _STEPS, "Storing the object", *measured)
     if (place.library.root / new.name).exists():
         raise InvalidInput("object name", repr(new.name), "one that is not taken yet")
     place.library.write(asset, f"upload of {file_name}")
-    yield AddingStep(_STEPS, _STEPS, "Ready", new.name, size, len(mesh.faces))
+    yield AddingStep(_STEPS, _STEPS, "Ready", *measured)
 
 
 def _bound() -> None:

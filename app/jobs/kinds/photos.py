@@ -39,11 +39,13 @@ class PhotoInput(Entry):
         K: intrinsics [px].
         T_world_camera: pose over the printed board; None if the photo shows none.
         names: of the objects that are marked in it.
+        focal_known: whether its focal length is more than a guess.
     """
 
     K: Matrix3
     T_world_camera: Matrix4 | None
     names: list[Text]
+    focal_known: bool = True
 
 
 class PhotoParams(JobParams):
@@ -88,7 +90,7 @@ def photo_job(params: PhotoParams, place: JobContext) -> Iterator[Finding]:
     Raises:
         OsfError: if an object has no field, nothing can be found, or the disk refuses.
     """
-    from osfcore.photo.poses import PhotoModels, estimate_photo
+    from osfcore.photo.poses import PhotoConfig, PhotoModels, estimate_photo
     from osfcore.photo.summary import summarised
 
     yield Finding(0, 0, "Loading fields")
@@ -98,9 +100,11 @@ def photo_job(params: PhotoParams, place: JobContext) -> Iterator[Finding]:
     models = PhotoModels({name: fields.load(name) for name in names})
     rng = stream_rng(params.seed, Stream.PHOTO_SEARCH)
     step = None
-    for step in estimate_photo(models, photos, names, rng):
+    config = PhotoConfig(focal_known=params.photos[0].focal_known)
+    for step in estimate_photo(models, photos, names, rng, config):
         yield Finding(step.progress.done, step.progress.total + 1, step.progress.note, len(step.found))
     assert step is not None
+    photos[0] = step.as_seen(photos[0])
     yield Finding(step.progress.total, step.progress.total + 1, "The lamp", len(step.found))
     write_json(place.folder / FOUND, encode(summarised(photos, step, models, params.notes)))
     for found in step.found:

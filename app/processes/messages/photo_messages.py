@@ -8,7 +8,7 @@ from typing import Literal
 from osfcore.geometry.poses import Pose
 from osfcore.photo.calibration import Calibration, KnownCamera, Sighting
 
-CameraSource = Literal["board", "given", "file", "assumed"]
+CameraSource = Literal["board", "given", "file", "objects", "assumed"]
 Points = tuple[tuple[float, float], ...]
 
 

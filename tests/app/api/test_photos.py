@@ -107,6 +107,22 @@ def test_a_damaged_photo_is_listed_as_such_until_it_is_deleted(service, services
     is_problem(service.delete("/api/photos/broken"), 404)
 
 
+@pytest.mark.slow
+def test_a_picture_is_kept_as_the_goal_or_the_photograph_that_it_is(service):
+    scene = service.post("/api/scenes", json={"seed": 3, "objects": [BOX, MUSTARD]}).json()
+    query = {"size": SIDE, "pusher": False}
+    png = service.get(f"/api/scenes/{scene['id']}/images/goal.png", params=query).content
+    made = service.post("/api/pictures?name=Mine", content=png, headers=ANY).json()
+    assert made["photo"] is None
+    assert (made["goal"]["name"], made["goal"]["source"], made["goal"]["width"]) == ("Mine", "upload", SIDE)
+    service.delete(f"/api/goals/{made['goal']['id']}")
+    made = service.post("/api/pictures", content=picture(service, scene), headers=ANY).json()
+    assert made["goal"] is None
+    assert made["photo"] == service.get(f"/api/photos/{made['photo']['id']}").json()
+    refuses(service.post("/api/pictures", content=b"a text", headers=ANY), 422, "no picture that can be read")
+    refuses(service.post("/api/pictures", content=b"{}", headers={"Content-Type": "application/json"}), 415, "photo")
+
+
 def test_the_board_can_be_printed(service):
     answer = service.get("/api/photos/board.pdf")
     assert answer.headers["content-type"] == "application/pdf"

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from osfcore.estimation.content_check import ContentChecker
+from osfcore.estimation.camera_response import srgb_of_linear
+from osfcore.estimation.content_check import ContentChecker, is_goal_view
 from osfcore.estimation.objective import ObjectModels
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import goal_camera
@@ -70,3 +71,20 @@ def test_a_plain_square_the_bare_table_and_a_picture_of_something_else_are_recog
     beside = replace(bare, poses=Pose(bare.poses.position + [5.0, 0, 0], bare.poses.quaternion))
     seen = observe(models, beside, [CAMERA], masks=False)
     assert checker.check(seen, bare).verdict == "bare"
+
+
+@pytest.mark.parametrize("light", [(0.5, 0.3, 0.8), (-0.7, 0.6, 0.3)])
+def test_pictures_of_the_goal_camera_are_told_from_photographs(models, light):
+    table = FieldLibrary(None).load_table()
+    seen = observe(models, at_rest(models, NAMES, light), [CAMERA], masks=False).images[0].astype(np.float32)
+    noise = np.random.default_rng(0).normal(0, 0.02, seen.shape)
+    for goal in (
+        seen,
+        seen[::-1, ::-1].copy(),
+        np.clip(seen + noise, 0, 1).astype(np.float32),
+        np.full_like(seen, 0.9),
+    ):
+        assert is_goal_view(table, goal, CAMERA)
+    as_a_phone_writes_it = srgb_of_linear(seen).astype(np.float32)
+    for photograph in (as_a_phone_writes_it, np.random.default_rng(1).random(seen.shape, np.float32)):
+        assert not is_goal_view(table, photograph, CAMERA)

@@ -144,6 +144,12 @@ def test_a_user_adds_an_object_and_may_replace_it(glb, shelf):
     assert shelf.info("my-ball").mass_kg == 2.0
 
 
+def test_a_mass_that_nobody_states_is_guessed_from_the_volume(glb, shelf):
+    added = add_object(glb, NewObject("light-ball", None), shelf)
+    half_of_water = 500 * 4 / 3 * np.pi * added.radius_m**3
+    assert shelf.info("light-ball").mass_kg == pytest.approx(half_of_water, rel=0.05)
+
+
 NAME, OTHER = "006_mustard_bottle", "003_cracker_box"
 
 

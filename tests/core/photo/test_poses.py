@@ -9,8 +9,16 @@ from scipy.spatial.transform import Rotation
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.estimation.objective import resting_orientations
 from osfcore.geometry.cameras import Camera
-from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, rotation_angle
+from osfcore.geometry.poses import (
+    Pose,
+    quaternion_conjugate,
+    quaternion_exp,
+    quaternion_multiply,
+    rotate,
+    rotation_angle,
+)
 from osfcore.photo.lamp import photo_light
+from osfcore.photo.photograph import Photograph
 from osfcore.photo.pose_loss import PoseLoss, TablePrior, draw, object_windows, surfels_of
 from osfcore.photo.poses import (
     FINE_ACROSS,
@@ -23,6 +31,7 @@ from osfcore.photo.poses import (
     moved,
     poses_around,
     poses_from_mask,
+    seen_through,
     super_fibonacci,
     table_from_objects,
     table_from_points,
@@ -127,6 +136,56 @@ def test_an_object_behind_another_of_which_half_is_marked(models, fields, taken)
     for found, pose in zip(last.found, (front, behind), strict=True):
         assert np.rad2deg(rotation_angle(found.best.pose.quaternion, pose.quaternion)) < 5
         assert found.doubt == ""
+
+
+# A focal length that nobody knows
+
+
+FOCAL, SIZE = 600.0, (400, 320)
+
+
+def lens(focal):
+    return np.array([[focal, 0, SIZE[0] / 2], [0, focal, SIZE[1] / 2], [0, 0, 1]])
+
+
+def test_through_another_lens_an_object_is_seen_in_the_same_place_from_the_same_side():
+    pose, half = Pose(np.array([0.2, -0.1, 0.7]), quaternion_exp(np.array([0.3, -1.0, 0.4]))), FOCAL / 2
+    seen = seen_through(pose, lens(half), lens(FOCAL))
+    before, after = (K @ p.position for K, p in ((lens(half), pose), (lens(FOCAL), seen)))
+    np.testing.assert_allclose(after / after[2], before / before[2])
+    sides = [rotate(quaternion_conjugate(p.quaternion), p.position / np.linalg.norm(p.position)) for p in (pose, seen)]
+    np.testing.assert_allclose(*sides, atol=1e-12)  # the ray, in the object's frame
+    back = seen_through(seen, lens(FOCAL), lens(half))
+    np.testing.assert_allclose(back.matrix(), pose.matrix(), atol=1e-12)
+    middle = Pose(np.array([0.0, 0.0, 0.5]), pose.quaternion)
+    np.testing.assert_allclose(seen_through(middle, lens(half), lens(FOCAL)).position, [0, 0, 1])
+
+
+@pytest.mark.slow
+def test_two_objects_on_a_table_show_the_focal_length(models, fields, taken):
+    """Assumed at half of what it is, from the poses at which such a lens shows both where they are."""
+    poses = []
+    for number, field in enumerate(fields.values()):
+        resting = resting_orientations(field)
+        turned = Pose(np.zeros(3), resting.quaternions[number])
+        place = np.array([0.16 * number - 0.13, 0.1 * number - 0.05, -resting.lowest(turned)])
+        poses.append(T_CAMERA_WORLD @ Pose(place, turned.quaternion))
+    both = Pose.stacked(poses)
+    batch = SceneBatch(tuple(fields), both.position[None], both.quaternion[None], taken.light[None], None)
+    camera = Camera("photo", Pose.identity(), lens(FOCAL), *SIZE)
+    drawn = SceneRenderer(fields, None).render(batch, [camera], outputs={"rgb", "masks"})
+    masks = dict(zip(fields, drawn.masks[0, 0], strict=True))
+    image = np.where(drawn.masks[0, 0].any(axis=0)[..., None], drawn.rgb[0, 0], 0.2).astype(np.float32)
+    photo = Photograph(image, np.ones(image.shape[:2], bool), lens(FOCAL / 2), Pose.identity(), False, masks)
+    starts = {name: seen_through(pose, lens(FOCAL), lens(FOCAL / 2)) for name, pose in zip(fields, poses, strict=True)}
+    config = PhotoConfig(starts, focal_known=False)
+    *steps, last = estimate_photo(models, [photo], tuple(fields), np.random.default_rng(0), config)
+    assert any("focal length" in step.progress.note for step in steps)
+    assert last.table is not None
+    assert last.intrinsics[0, 0] == pytest.approx(FOCAL, rel=0.1)
+    np.testing.assert_array_equal(last.as_seen(photo).intrinsics, last.intrinsics)
+    for found, pose in zip(last.found, poses, strict=True):
+        assert np.rad2deg(rotation_angle(found.best.pose.quaternion, pose.quaternion)) < 6
 
 
 # Pose search
