@@ -1,5 +1,4 @@
 // Small charts over the steps of an episode, drawn by uPlot: lines, and stacked bars. The label says the latest values.
-import uPlot from "../vendor/uPlot-1.6.32.js";
 import { el } from "./dom.js";
 
 const HEIGHT = 132;

@@ -1,5 +1,4 @@
 // Estimates of poses and light: asking for one, following it, and what came of it.
-import { zipSync } from "../vendor/fflate-0.8.3.js";
 import { get, post, remove, upload } from "./api.js";
 import { LatestImage } from "./cameras.js";
 import { drawCurves, drawKey } from "./curves.js";
@@ -46,6 +45,7 @@ async function sendFolder(files) {
     throw new Error("The folder holds no observation.json; an observation folder is expected.");
   }
   const entries = await Promise.all(named.map(async ({ name, blob }) => [name, new Uint8Array(await blob.arrayBuffer())]));
+  const { zipSync } = await import("../vendor/fflate-0.8.3.js"); // few need it
   const zip = zipSync(Object.fromEntries(entries), { level: 0 }); // PNGs do not shrink
   await send(new Blob([zip], { type: "application/zip" }), named[0].name.split("/")[0]);
 }

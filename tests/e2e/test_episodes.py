@@ -102,7 +102,7 @@ def test_a_first_visit_ends_with_a_finished_episode_from_an_uploaded_image(page,
     service.call("DELETE", f"goals/{drawn['id']}")
     page.wait_for_selector("#start-episode[disabled]")
     page.set_input_files("#goal-file", photo)
-    page.wait_for_selector('#goal-image[alt^="Goal: how it should look"]', timeout=WAIT_MS)
+    page.wait_for_selector('#goal-image[alt^="Goal: how it should look"]', timeout=LONG_MS)
     begin(page, SHORT)
     page.wait_for_selector("#run-idle:not([hidden])", timeout=LONG_MS)
     episode = service.episode()

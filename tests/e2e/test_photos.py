@@ -12,7 +12,7 @@ from tests.e2e.conftest import leave_out_view, watch_errors
 from tests.live import call, free_port, start_service, stop_service
 
 pytestmark = pytest.mark.e2e
-WAIT_MS = 60_000
+WAIT_MS = 180_000  # the first time on a machine the renderer is compiled
 TABLE, OTHER = ["003_cracker_box", "006_mustard_bottle"], ["005_tomato_soup_can"]
 BORDER = 300  # of what lies around the table in a photo [px]
 
