@@ -1,5 +1,4 @@
 // What this is, shown before anybody clicks: a recorded episode on the timeline, its goal, its table, and how far it is.
-import { asked } from "./address.js";
 import { get, post } from "./api.js";
 import { drawLegend } from "./charts.js";
 import { COLOURS, svg } from "./curves.js";
@@ -25,7 +24,6 @@ const PATIENCE_MS = 30_000; // with a 3D view that does not open; then pictures 
 const SEEN = "osf-story-seen";
 const [WIDTH, HEIGHT] = [300, 64];
 
-const isLinked = Boolean(asked().episode);
 const isStill = matchMedia("(prefers-reduced-motion: reduce)"); // then it stands until somebody plays it
 
 let stories = [];
@@ -164,7 +162,7 @@ function moveLamp() {
 }
 
 /** Whether somebody came for something else. */
-const hasOtherPlans = () => LIVE.has(known("episode")?.state) || Boolean(known("opened")) || isLinked;
+const hasOtherPlans = () => LIVE.has(known("episode")?.state) || Boolean(known("opened"));
 
 export async function setUpStory() {
   const run = byId("story-run");
@@ -173,11 +171,16 @@ export async function setUpStory() {
   byId("story-lamp").addEventListener("click", moveLamp);
   byId("story-button").addEventListener("click", open);
   watch("episode", (job) => { byId("story-button").disabled = LIVE.has(job?.state); });
+  const isFirst = !byId("story-foot").hidden; // first-visit.js has made room
   const [answer] = await Promise.all([tellFailure(() => get("stories")), refreshObjects()]);
   // Those that can be run live come first.
   const answers = (answer?.stories ?? []).filter(({ outcome }) => outcome === "reached");
   const canRun = (one) => one.objects.every(isHere);
   stories = [...answers.filter(canRun), ...answers.filter((one) => !canRun(one))];
   byId("story-button").hidden = !stories.length;
-  if (!hasOtherPlans() && !sessionStorage.getItem(SEEN)) open();
+  if (isFirst && stories.length && !hasOtherPlans()) open();
+  else if (isFirst && !isOn) {
+    show(false);
+    byId("timeline-bar").hidden = !timeline.source;
+  }
 }
