@@ -171,15 +171,20 @@ export async function setUpStory() {
   byId("story-lamp").addEventListener("click", moveLamp);
   byId("story-button").addEventListener("click", open);
   watch("episode", (job) => { byId("story-button").disabled = LIVE.has(job?.state); });
-  const isFirst = !byId("story-foot").hidden; // first-visit.js has made room
+  isOn = !byId("story-foot").hidden; // first-visit.js has made room
   const [answer] = await Promise.all([tellFailure(() => get("stories")), refreshObjects()]);
   // Those that can be run live come first.
   const answers = (answer?.stories ?? []).filter(({ outcome }) => outcome === "reached");
   const canRun = (one) => one.objects.every(isHere);
   stories = [...answers.filter(canRun), ...answers.filter((one) => !canRun(one))];
   byId("story-button").hidden = !stories.length;
-  if (isFirst && stories.length && !hasOtherPlans()) open();
-  else if (isFirst && !isOn) {
+  run.disabled = !stories.length;
+  if (!isOn) return;
+  if (stories.length && !hasOtherPlans()) {
+    show(true);
+    play();
+  } else {
+    isOn = false;
     show(false);
     byId("timeline-bar").hidden = !timeline.source;
   }
