@@ -50,6 +50,7 @@ class Stream(IntEnum):
     FACTOR_FRAME = 92  # what a factor leaves to chance in a measured first frame: wood, errors of cameras, noise
     PAPER_SCENE = 94  # scenes whose poses and light are estimated as published, under choices that its text leaves open
     UNROLLED_SCENE = 96  # scenes whose estimates are shown step by step
+    SAMPLE_WOOD = 97  # of the table in the sample photograph
     LAMP_SCENE = 95  # scenes under lamps that are estimated, and the photographs of them
 
 

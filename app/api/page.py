@@ -98,10 +98,10 @@ def show(services: ServicesDep, visitor: VisitorPath, body: ViewIn) -> ViewOut:
     return ViewOut(is_open=services.viewer.pages.ask(visitor, Wish(replay, body.shows, goal)))
 
 
-@views_router.post("/{visitor}/camera")
-def frame(services: ServicesDep, visitor: VisitorPath) -> ViewOut:
+@views_router.post("/{visitor}/camera", status_code=204)
+def frame(services: ServicesDep, visitor: VisitorPath) -> None:
     """Place the camera of one page's 3D view anew, so that the objects fill it."""
-    return ViewOut(is_open=services.viewer.pages.frame(visitor))
+    services.viewer.pages.frame(visitor)
 
 
 presets_router = APIRouter(prefix="/api/presets", tags=["presets"], responses=problems(), route_class=BoundedRoute)

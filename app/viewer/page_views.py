@@ -203,19 +203,14 @@ class PageViews(Panel):
             known.wish, known.is_due = wish, True
             return known.view is not None
 
-    def frame(self, page: str) -> bool:
-        """Place the camera of a page's view anew, so that the objects fill it. Any thread may call.
-
-        Returns:
-            Whether the view is open.
-        """
+    def frame(self, page: str) -> None:
+        """Place the camera of a page's view anew, so that the objects fill it, if it is open. Any thread may call."""
         with self._thread.changing():
             known = self._page(page)
             view = known.view
             if view is not None:
                 known.framed = self._live() if view.nodes is None else view.nodes.table.state()
             known.is_due = True
-            return view is not None
 
     def add_client(self, client: viser.ClientHandle) -> None:
         """Show what a page has asked for in the browser that has opened its view, perhaps once more."""

@@ -20,6 +20,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.io.files import write_json
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.imaging import Lamp, RayTracer, TableSurface, TracedMesh, masks_of, wooden_texture
 
 PHOTO, BOXES = "table.jpg", "table.json"
@@ -41,7 +42,7 @@ def write_sample_photo(library: AssetLibrary, folder: Path) -> None:
         library: with the objects' meshes.
         folder: must exist.
     """
-    surface = TableSurface(texture=wooden_texture(np.random.default_rng(0)))
+    surface = TableSurface(texture=wooden_texture(stream_rng(0, Stream.SAMPLE_WOOD)))
     meshes = {name: TracedMesh(library.load(name).mesh) for name in _STANDING}
     tracer = RayTracer(meshes, lamp=Lamp(intensity=0.9, colour=(1.0, 0.93, 0.82)), table=surface)
     (seen,) = tracer.render(_state(library), (_camera(),))

@@ -118,7 +118,8 @@ def test_what_scripts_cut_off_or_count_is_what_rest_states():
     assert stands("scenes", r"MOST_OBJECTS = (\d+)") == property_of("SceneIn.objects")["maxItems"]
     assert stands("scenes", r"Math\.random\(\) \* ([\d_]+)") <= property_of("SceneIn.seed")["maximum"]
     assert stands("goals", r"DRAWN_SEEDS = ([\d_]+)") <= property_of("RandomLayout.seed")["maximum"]
-    assert stands("goals", r"NAME_MAX = (\d+)") == query_of("post", "/api/goals", "name")["maxLength"]
+    for path in ("/api/pictures", "/api/goals", "/api/photos"):
+        assert stands("picture", r"NAME_MAX = (\d+)") == query_of("post", path, "name")["maxLength"]
     assert stands("fields", r"slice\(-(\d+)\)") == query_of("post", "/api/fields/sets", "file_name")["maxLength"]
     assert stands("estimate", r"slice\(-(\d+)\)") == query_of("post", "/api/estimates", "file_name")["maxLength"]
     assert stands("api", r"limit: (\d+)") == query_of("get", "/api/goals", "limit")["maximum"]

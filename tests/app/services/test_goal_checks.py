@@ -99,7 +99,7 @@ def checks(goals, link, fields):
         ("doubtful", False, "not certain that this photo shows the cracker box and the mug"),
         ("bare", True, "Nothing can be seen on the table"),
         ("others", True, "does not seem to show the cracker box and the mug"),
-        ("elsewhere", True, "does not show the table as the goal camera sees it; crop it"),
+        ("elsewhere", True, "does not show the table as the goal camera sees it"),
     ],
 )
 def test_what_a_photo_shows_is_told_in_words(checks, link, verdict, is_refused, words):
