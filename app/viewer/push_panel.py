@@ -33,7 +33,7 @@ from osfcore.objects.asset_library import AssetLibrary
 _SPEED = 0.05, MAX_SPEED_M_S  # slowest and fastest
 TICK_S = 0.03  # between two pictures of a moving ghost
 _KEY = "viewer"
-_IDLE = "No push is chosen yet"
+_IDLE, _AIMED = "No push is chosen yet", "Let go of the pusher to predict this push"
 _EXECUTING, _EXECUTED = "Executing", "Executed. Purple: predicted; black: the true ways"
 _CHANGED = "The table has changed; predict again"
 Act = Callable[[str, list[np.ndarray]], SceneRecord]
@@ -92,7 +92,7 @@ class PushPanel(Panel):
             self._player = PushPlayer(gui, self._thread)
             gui.add_button("Clear", hint="Remove what is drawn of a push.").on_click(lambda _: self._forget())
         nearest.on_click(lambda event: self._run_command(partial(self._predict_nearest, event.client), event.client))
-        self._speed.on_update(lambda event: None if event.client is None else self._aim(None))
+        self._speed.on_update(self._change_speed)
         pusher.on_drag(self._drag)
         self._execute_button.on_click(lambda event: self._run_command(self._execute, event.client))
 
@@ -136,6 +136,13 @@ class PushPanel(Panel):
             self._message = self._library.in_words(text)
 
     # Predicting and executing; called in viser's pool
+
+    def _change_speed(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+        """Predict the chosen push anew at another speed."""
+        target = self._target
+        if event.client is not None and target is not None:
+            self._aim(target)
+            self._run_command(partial(self._predict, event.client), event.client)
 
     def _predict_nearest(self, client: Client) -> None:
         self._aim(beyond_nearest(self._predictions.current().state))

@@ -304,15 +304,19 @@ class SceneNodes:
                 pointed = np.asarray(event.end_position, float)
                 at = level_point(np.asarray(event.client.camera.position), pointed, before[2] + offset_m[2])
                 pose = Pose(before if at is None else at - offset_m, np.array(held.wxyz, float))
-                put(held, pose.position)
-                self._place_labels()
-                self._draw_shadows()
+                self._carry(held, pose)
             self._on_change()
             if event.phase == "end":
                 self._grabbed.pop(name, None)
                 on_move(name, pose, event.client)
 
         body.on_drag(drag)
+
+    def _carry(self, body: viser.SceneNodeHandle, pose: Pose) -> None:
+        """Move an object with a hand, and with it the names and shadows."""
+        put(body, pose.position, pose.quaternion)
+        self._place_labels()
+        self._draw_shadows()
 
     def _add_handle(self, name: str, on_move: Callable[[str, Pose, Client], None]) -> viser.TransformControlsHandle:
         gizmo = self._scene.add_transform_controls(
@@ -326,9 +330,7 @@ class SceneNodes:
                 # Handles stay along the axes of the table: what they turn is added to how the object lay before.
                 turn, before = np.array(event.target.wxyz), self._grabbed.setdefault(name, np.array(body.wxyz))
                 pose = Pose(np.array(event.target.position, float), quaternion_multiply(turn, before))
-                put(body, pose.position, pose.quaternion)
-                self._place_labels()
-                self._draw_shadows()
+                self._carry(body, pose)
             self._on_change()
             if event.phase == "end":
                 self._grabbed.pop(name, None)

@@ -316,6 +316,7 @@ def test_a_prediction_is_dropped_when_the_table_changes_or_another_push_is_chose
     room.predict()
     room.gui.set("Speed, m/s", 0.1)
     until(lambda: room.moving() == set())
+    assert np.linalg.norm(room.asked[-1].actions, axis=-1).max() <= 0.1 + 1e-9  # the same push, slower
     room.predict()
     room.panel.show(CurrentScene(None))
     until(lambda: room.moving() == set())
