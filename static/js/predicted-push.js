@@ -9,7 +9,7 @@ const STILL = 0.05; // mm, deg; less is not worth a number
 const DRAWN = new Set(["predicted", "executing", "executed"]);
 const digits = (value) => (value < 9.95 ? value.toFixed(1) : value.toFixed(0));
 const motion = (mm, deg) => (mm < STILL && deg < STILL ? "still" : `${digits(mm)} mm, ${digits(deg)}°`);
-const isStill = ({ predicted_mm: mm, predicted_deg: deg, went_mm: went, turned_deg: turned }) => [mm, deg, went ?? 0, turned ?? 0].every((far) => far < STILL);
+const isStill = ({ predicted_mm: mm, predicted_deg: deg, went_mm: went, turned_deg: turned }) => Math.max(mm, deg, went ?? 0, turned ?? 0) < 1;
 const moves = ({ predicted_mm: mm, predicted_deg: deg }) => mm >= 3 || deg >= 3; // as purple ghosts do
 
 function told(push) {
