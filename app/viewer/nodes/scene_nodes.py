@@ -24,6 +24,7 @@ from app.viewer.nodes.room import (
     atomic,
     colour_of,
     put,
+    send_again,
     separated,
 )
 from osfcore.errors import OsfError
@@ -38,14 +39,14 @@ from osfcore.world.imaging import TABLE_ALBEDO
 # Everything that is drawn of the live table, here and elsewhere; the room around it is not.
 LIVE_NODES = (
     "/objects", "/names", "/handles", "/shadows", "/cameras", "/pusher", "/light", "/light_ray", "/light_name",
-    "/light_handle", "/episode", "/estimate", "/push", "/goal",
+    "/episode", "/estimate", "/push", "/goal",
 )  # fmt: skip
 # A browser's own lamp takes the place of the one for all, wherever its other nodes are: the table is dark while a lamp
 # that was hidden is put up again.
 LAMP = "/lamp"
 LABEL_GAP_M = 0.01
 _SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of the corners of a box
-_NUDGE = 1e-7  # viser sends nothing that is as it was
+_BALL_M, _BALL_OPACITY = 0.03, 0.12
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
 
@@ -105,7 +106,8 @@ class SceneNodes:
         self._lamp = self._scene.add_light_directional(LAMP, intensity=float(np.pi * DIFFUSE), position=start)
         self._marker = LightMarker(self._scene, f"{root}/light")
         self._place_light(np.array(start))
-        self._light_gizmo = None if on_light is None else self._add_light_handle(on_light, start)
+        if on_light is not None:
+            self._let_drag_light(on_light)
         self._frustums = {camera.name: self._frustum(camera) for camera in cameras}
 
     def show(self, state: SceneState | None) -> None:
@@ -157,8 +159,6 @@ class SceneNodes:
                 put(self.pusher, state.pusher)
             if not self._is_light_held:
                 self._place_light(state.light.position)
-                if self._light_gizmo is not None:
-                    put(self._light_gizmo, AT * state.light.position)
             self._draw_shadows()
         self._on_change()
 
@@ -219,35 +219,45 @@ class SceneNodes:
     def put_handles_back(self) -> None:
         """Send where the handles are once more: a browser may have moved its own."""
         with self._lock:
-            for handle in (self._light_gizmo, *self._gizmos.values()):
-                if handle is not None:
-                    handle.position = np.asarray(handle.position, float) + _NUDGE
-                    handle.wxyz = np.asarray(handle.wxyz, float) * (1 + _NUDGE)
+            for handle in self._gizmos.values():
+                send_again(handle)
 
-    def _add_light_handle(
-        self, on_light: Callable[[Light, Client], None], start: tuple[float, float, float]
-    ) -> viser.TransformControlsHandle:
-        gizmo = self._scene.add_transform_controls(
-            f"{self._root}/light_handle", scale=0.08, disable_rotations=True, position=start, depth_test=False
+    def _let_drag_light(self, on_light: Callable[[Light, Client], None]) -> None:
+        """Let a hand take hold of the light's mark, and lead it over the dome on which it stands."""
+        # Below the mark, and so where it is; larger than it looks, so that a finger finds it.
+        ball = self._scene.add_icosphere(
+            f"{self._root}/light/ball",
+            _BALL_M,
+            LIGHT_COLOUR,
+            opacity=_BALL_OPACITY,
+            cast_shadow=False,
+            receive_shadow=False,
         )
+        offset_m = np.zeros(3)  # from where the hand has it to the mark
+        is_far = is_beside = False
 
-        async def drag(event: viser.TransformControlsEvent) -> None:
-            light = light_toward(np.asarray(event.target.position))
-            is_over = event.phase == "end"
+        async def drag(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
+            nonlocal offset_m, is_far, is_beside
+            eye, is_over = np.asarray(event.client.camera.position), event.phase == "end"
             with self._lock:  # another thread may be placing what the scene says
+                if event.phase == "start":
+                    mark = AT * np.asarray(self._lamp.position)
+                    offset_m = mark - np.asarray(event.start_position, float)
+                    is_far, is_beside = bool(mark @ (mark - eye) > 0), False
+                was_beside = is_beside
+                point, is_beside = dome_point(eye, np.asarray(event.end_position, float) + offset_m, is_far=is_far)
+                is_far ^= is_beside and not was_beside  # beyond the edge it comes back on the other side
                 self._is_light_held = not is_over
+                light = light_toward(point)
                 if light is None:
                     return
                 self._place_light(light.position)
                 self._draw_shadows()
-                if is_over:
-                    event.target.position = tuple(AT * light.position)
             self._on_change()
             if is_over:
                 on_light(light, event.client)
 
-        gizmo.on_update(drag)
-        return gizmo
+        ball.on_drag(drag)
 
     def _frustum(self, camera: Camera) -> viser.CameraFrustumHandle:
         pose = camera.T_world_camera
@@ -361,11 +371,9 @@ class SceneNodes:
         self._marker.place(position)
 
     def _show_light(self) -> None:
-        """Show the light's handle and mark as the panels request it."""
+        """Show the light's mark as the panels request it."""
         others = [request for request in self._light_requests.values() if request != (True, "")]
         is_on, name = max(others, default=(True, ""))
-        if self._light_gizmo is not None:
-            self._light_gizmo.visible = is_on
         colour = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR
         self._marker.show(is_on=is_on, has_ray=self.pusher.visible, text=name, colour=colour)
 
@@ -385,6 +393,29 @@ def level_point(
         return None
     point = eye + (eye[2] - height_m) / slope * (through - eye)
     return point if np.abs(point[:2]).max() <= TABLE_SIDE_M / 2 else None
+
+
+def dome_point(
+    eye: Float[np.ndarray, "3"], through: Float[np.ndarray, "3"], *, is_far: bool
+) -> tuple[Float[np.ndarray, "3"], bool]:
+    """Return where a ray from the eye through a point meets the dome of the lights' marks, and whether it passes by.
+
+    With u the direction of the ray, f = eye - (eye . u) u is nearest to the table's centre, and the ray meets the
+    dome's sphere of radius r at f -+ sqrt(r^2 - |f|^2) u. Beside the sphere, the point of it that is nearest counts.
+
+    Args:
+        eye: where the ray begins [m].
+        through: a point on it [m].
+        is_far: whether the far one of two points counts; only one may be above the table, or before the eye.
+    """
+    way = (through - eye) / max(float(np.linalg.norm(through - eye)), 1e-9)
+    nearest = eye - (eye @ way) * way
+    half_m = np.sqrt(max(AT**2 - float(nearest @ nearest), 0.0))
+    if half_m == 0.0:
+        return AT * nearest / np.linalg.norm(nearest), True
+    near, far = nearest - half_m * way, nearest + half_m * way
+    is_inside = bool(eye @ eye < AT**2)
+    return (far if is_inside or (is_far and far[2] >= 0) else near), False
 
 
 def extent_m(

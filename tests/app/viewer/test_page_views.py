@@ -1,5 +1,6 @@
 """Views of single pages, with browsers that speak viser's protocol through the relay."""
 
+import contextlib
 import gc
 import threading
 import time
@@ -10,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 import viser
+import zstandard
 from websockets.sync.client import connect
 
 from app.episodes.trajectory import ReplayClock, read_trajectory
@@ -17,7 +19,7 @@ from app.services.examples import Stories
 from app.viewer.page_views import PageViews, Replay, Wish
 from app.viewer.private_server import SECRET_HEADER
 from tests.app.conftest import until
-from tests.app.viewer.conftest import uuid_of
+from tests.app.viewer.conftest import BOX, uuid_of
 
 STORY = "first"
 CAMERA = {
@@ -57,6 +59,17 @@ class Page:
 
     def send(self, frame):
         self._socket.send(frame)
+
+    def told_about(self, path):
+        """Kinds of messages about a node that have come since this was asked for last."""
+        kinds = set()
+        with contextlib.suppress(TimeoutError):
+            while True:
+                frame = self._socket.recv(timeout=0.3)
+                packed = frame[16 : 16 + int.from_bytes(frame[8:16], "little")]
+                content = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed))
+                kinds |= {message["type"] for message in content["messages"] if message.get("name") == path}
+        return kinds
 
     @property
     def client(self):
@@ -168,6 +181,26 @@ def test_a_page_that_only_watches_moves_its_camera_and_nothing_else(live):
     finally:
         driver.leave("drives")
         button.remove()
+
+
+@pytest.mark.parametrize("handles", [f"/handles/{BOX}", f"/goal/objects/{BOX}"])
+def test_handles_that_a_watcher_moved_in_its_own_browser_go_back(live, shown, handles):
+    end = msgspec.msgpack.encode({"type": "TransformControlsDragEndMessage", "name": handles, "owner": ""})
+    driver, told = live.services.driver, set()
+    live.request("POST", "/api/goals/draft", {"scene": None})
+    until(lambda: live.services.viewer.server.scene.get_handle_by_name(handles))
+    try:
+        driver.arrive("drives")
+        with opened(live, "watches") as page:
+            until(lambda: "TransformControlsMessage" in page.told_about(handles))
+            until(lambda: not page.told_about(handles))  # all that was there before has come
+            page.send(end)
+            until(
+                lambda: told.update(page.told_about(handles)) or told >= {"SetPositionMessage", "SetOrientationMessage"}
+            )
+    finally:
+        driver.leave("drives")
+        live.request("DELETE", "/api/goals/draft")
 
 
 def test_a_chosen_goal_is_golden_on_the_live_table_alone(live, shown):

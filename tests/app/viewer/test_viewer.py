@@ -35,15 +35,16 @@ def test_handles_show_only_when_wanted(live, browser, shown):
     until(lambda: not any(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
 
 
-def test_a_goal_is_composed_with_handles_of_its_own(live, browser, shown):
+def test_a_goal_is_composed_with_copies_of_its_own(live, browser, shown):
     browser.set("Handles", True)
     until(lambda: all(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
     live.request("POST", "/api/goals/draft", {"scene": None})
     until(lambda: browser.below("/goal/objects") == {BOX, BOTTLE})
     until(lambda: not any(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
     copy = f"/goal/objects/{BOX}"
-    aside = np.array(browser.node(copy).position) + [0.03, 0, 0]
-    browser.drag(copy, aside)
+    at = np.array(browser.node(copy).position)
+    aside = at + [0.03, 0, 0]
+    browser.drag_body(f"{copy}/shape", at + [0, 0, 1], at, aside)
     until(lambda: np.allclose(browser.node(copy).position, aside, atol=2e-3))
     assert live.request("GET", f"/api/scenes/{shown['id']}")[1]["objects"] == shown["objects"]  # only the copy moves
     live.request("DELETE", "/api/goals/draft")
