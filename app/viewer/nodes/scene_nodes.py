@@ -47,6 +47,7 @@ LAMP = "/lamp"
 LABEL_GAP_M = 0.01
 _SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of the corners of a box
 _BALL_M, _BALL_OPACITY = 0.03, 0.12
+_BELOW_M = 0.06  # a hand that takes the lowest light by the lower half of its ball points below the table
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
 
@@ -233,19 +234,17 @@ class SceneNodes:
             cast_shadow=False,
             receive_shadow=False,
         )
-        offset_m = np.zeros(3)  # from where the hand has it to the mark
         is_far = is_beside = False
 
         async def drag(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
-            nonlocal offset_m, is_far, is_beside
+            nonlocal is_far, is_beside
             eye, is_over = np.asarray(event.client.camera.position), event.phase == "end"
             with self._lock:  # another thread may be placing what the scene says
                 if event.phase == "start":
                     mark = AT * np.asarray(self._lamp.position)
-                    offset_m = mark - np.asarray(event.start_position, float)
                     is_far, is_beside = bool(mark @ (mark - eye) > 0), False
                 was_beside = is_beside
-                point, is_beside = dome_point(eye, np.asarray(event.end_position, float) + offset_m, is_far=is_far)
+                point, is_beside = dome_point(eye, np.asarray(event.end_position, float), is_far=is_far)
                 is_far ^= is_beside and not was_beside  # beyond the edge it comes back on the other side
                 self._is_light_held = not is_over
                 light = light_toward(point)
@@ -406,7 +405,8 @@ def dome_point(
     Args:
         eye: where the ray begins [m].
         through: a point on it [m].
-        is_far: whether the far one of two points counts; only one may be above the table, or before the eye.
+        is_far: whether the far one of two points counts, unless it is far below the table; before an eye that is in
+            the dome there is no other.
     """
     way = (through - eye) / max(float(np.linalg.norm(through - eye)), 1e-9)
     nearest = eye - (eye @ way) * way
@@ -415,7 +415,7 @@ def dome_point(
         return AT * nearest / np.linalg.norm(nearest), True
     near, far = nearest - half_m * way, nearest + half_m * way
     is_inside = bool(eye @ eye < AT**2)
-    return (far if is_inside or (is_far and far[2] >= 0) else near), False
+    return (far if is_inside or (is_far and far[2] >= -_BELOW_M) else near), False
 
 
 def extent_m(
