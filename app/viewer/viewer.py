@@ -19,11 +19,13 @@ import viser
 from app.jobs.job import JobChanged
 from app.processes.client import ProcessClient
 from app.processes.messages.scene_messages import SceneRecord
+from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged, Goals
 from app.services.pushes import Pushes
 from app.services.runner import Runner
 from app.storage.paths import without_places
+from app.storage.records import Poses
 from app.viewer.drawing import DrawingThread, Panel, Playback
 from app.viewer.goal_panel import GoalPanel
 from app.viewer.job_panels import EpisodePanel, EstimatePanel
@@ -65,6 +67,7 @@ class Viewer:
         self._commands = ThreadPoolExecutor(1, thread_name_prefix="viewer-commands")
         self._memory = DrawingThread("viewer-memory", release_memory, _RELEASE_INTERVAL_S)
         self._server: PrivateViser | None = None
+        self._driver: str | None = None
         self._undo: list[Callable[[], None]] = []
 
     @property
@@ -125,6 +128,7 @@ class Viewer:
     def put_handles_back(self) -> None:
         """Show all handles where they were, in every browser: one was dragged by somebody who only watches."""
         self._drawing.put_handles_back()
+        self._goal_panel.put_handles_back()
 
     def _make_panels(self, server: PrivateViser) -> tuple[Panel, ...]:
         """Make what draws jobs, goals and pushes."""
@@ -150,20 +154,24 @@ class Viewer:
         return None if current is None else self._runner.scenes.get(current)
 
     def _move_object(self, name: str, pose: Pose, client: Client) -> None:
-        """An object was let go; where it must not be, it goes back. Called on viser's loop."""
+        """An object was let go. Called on viser's loop."""
+        self._edit(client, poses=((name, pose),), settle=True)
 
-        def move(scene: str) -> None:
+    def _move_light(self, light: Light, client: Client) -> None:
+        """The light was let go. Called on viser's loop."""
+        self._edit(client, light=light)
+
+    def _edit(self, client: Client, light: Light | None = None, poses: Poses = (), *, settle: bool = False) -> None:
+        """Change the scene as a hand did; what is refused goes back."""
+
+        def edit(scene: str) -> None:
             try:
-                self._runner.scenes.edit(scene, poses=((name, pose),), settle=True)
+                self._runner.scenes.edit(scene, light, poses, settle=settle)
             except OsfError:
                 self._show_current()
                 raise
 
-        self._commands.submit(self._on_current, move, client)
-
-    def _move_light(self, light: Light, client: Client) -> None:
-        """The light was let go. Called on viser's loop."""
-        self._commands.submit(self._on_current, lambda scene: self._runner.scenes.edit(scene, light=light), client)
+        self._commands.submit(self._on_current, edit, client)
 
     def _on_current(self, command: Callable[[str], object], client: Client) -> None:
         scene = self._runner.scenes.current
@@ -185,6 +193,10 @@ class Viewer:
     def _on_event(self, event: object) -> None:
         if isinstance(event, JobChanged | DraftChanged | CurrentScene):
             self._update_gizmos()
+        if isinstance(event, DriverChanged) and event.driver != self._driver:
+            self._driver = event.driver
+            self._show_current()  # what the former driver still holds is let go
+            self._goal_panel.put_handles_back()
 
     def _update_gizmos(self) -> None:
         """Let objects be dragged while no job holds the scene and no goal is being composed."""

@@ -1,4 +1,4 @@
-"""Each picture that the 3D view draws, as it changes from one table to another."""
+"""Each picture that the 3D view draws, as it changes from one table to another, and what hands drag in it."""
 
 import json
 import shutil
@@ -9,8 +9,10 @@ import pytest
 
 from app.episodes.trajectory import read_trajectory
 from app.services.examples import Stories
+from app.viewer.nodes.room import AT
 from tests.e2e.conftest import watch_errors
 from tests.e2e.test_episodes import until
+from tests.e2e.test_neural import seen_at
 from tests.live import live_service
 
 pytestmark = pytest.mark.e2e
@@ -47,8 +49,8 @@ def service(library, tmp_path_factory):
         yield url
 
 
-def call(service, method, path, body):
-    data = json.dumps(body).encode()
+def call(service, method, path, body=None):
+    data = None if body is None else json.dumps(body).encode()
     request = urllib.request.Request(f"{service}/api/{path}", data, {"Content-Type": "application/json"}, method=method)
     with urllib.request.urlopen(request, timeout=60) as answer:
         return json.load(answer)
@@ -126,3 +128,45 @@ def test_the_table_stays_lit_between_a_recording_and_the_live_table(service, vie
     call(service, "PUT", "views/watched", {"replay": None})
     pictures += [*settled(view, has_box_alone)]
     assert np.abs(np.array(pictures)[:, BARE] - lit).max() <= 5
+
+
+def drag(view, *spots):
+    """Take hold of something at the first spot, once it can be taken there, and let it go at the last."""
+
+    def is_over_it():
+        view.mouse.move(*spots[0] + [1, 1])
+        view.mouse.move(*spots[0])
+        return view.evaluate("[...document.querySelectorAll('canvas')].some((c) => c.style.cursor === 'pointer')")
+
+    until(is_over_it, DRAW_S)
+    view.mouse.down()
+    for spot in spots[1:]:
+        view.mouse.move(*spot, steps=4)
+    view.mouse.up()
+
+
+def test_the_lamp_and_the_copies_of_a_goal_are_dragged(service, view, library):
+    name, near_px = "009_gelatin_box", 6
+    scene = table(service, name, -0.1, [-0.3, -0.2, 0.9])
+    view.reload()  # from now on it stands where this table fills it
+    settled(view, lambda pictures: pictures[:, BARE].max(axis=-1) > 50)
+
+    def seen(point):
+        return seen_at([point], scene, library, 800, 600)[0]
+
+    def lamp():
+        return AT * np.array(call(service, "GET", f"scenes/{scene['id']}")["light"]["position"])
+
+    def copy():
+        return np.array(call(service, "GET", "goals/draft")["objects"][0]["position"])
+
+    spot = np.array([300.0, 150.0])
+    drag(view, seen(lamp()), spot)
+    until(lambda: np.linalg.norm(seen(lamp()) - spot) < near_px)
+
+    call(service, "POST", "goals/draft", {"scene": None})
+    aside = {"name": name, "position": [-0.05, 0.1, 0.016], "quaternion": FLAT}
+    call(service, "PATCH", "goals/draft", {"objects": [aside]})
+    at, spot = seen(aside["position"]), np.array([500.0, 400.0])
+    drag(view, at, spot)
+    until(lambda: np.linalg.norm(seen(copy()) - spot) < near_px)

@@ -22,6 +22,7 @@ NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 NO_LINES = np.zeros((1, 2, 3), np.float32)  # viser has no node of no lines
 GAMMA = 2.2  # of viser's colours
 _STILL = 1e-6  # poses that differ by less are not sent again
+_ASIDE_M = 1e-3
 Colour = tuple[int, int, int]
 Target = viser.ViserServer | viser.ClientHandle  # what draws for all browsers, or for one
 
@@ -109,6 +110,13 @@ def put(node: viser.SceneNodeHandle, position: np.ndarray, quaternion: np.ndarra
         node.position = np.asarray(position, float)
     if quaternion is not None and not np.abs(np.asarray(node.wxyz) - quaternion).max() <= _STILL:
         node.wxyz = np.asarray(quaternion, float)
+
+
+def send_again(node: viser.SceneNodeHandle) -> None:
+    """Send where a node is once more: a browser may have moved its own."""
+    position, quaternion = np.array(node.position), np.array(node.wxyz)
+    node.position, node.wxyz = position + _ASIDE_M, -quaternion  # viser sends nothing that is as it was
+    node.position, node.wxyz = position, quaternion
 
 
 # Labels

@@ -11,8 +11,19 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.nodes.ghosts import UNKNOWN_M, Mesh, box
-from app.viewer.nodes.room import AT, GAMMA, LAMP_COLOUR, NO_TURN, LightMarker, Target, atomic, colour_of, put
+from app.viewer.nodes.ghosts import UNKNOWN_M, Mesh, box, size_m
+from app.viewer.nodes.room import (
+    AT,
+    GAMMA,
+    LAMP_COLOUR,
+    NO_TURN,
+    LightMarker,
+    Target,
+    atomic,
+    colour_of,
+    put,
+    send_again,
+)
 from osfcore.errors import OsfError
 from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose, quaternion_multiply, quaternion_to_matrix
@@ -23,7 +34,7 @@ from osfcore.world.imaging import TABLE_ALBEDO
 
 # Everything that is drawn of the live table, here and elsewhere; the room around it is not.
 LIVE_NODES = (
-    "/objects", "/handles", "/shadows", "/pusher", "/light", "/light_ray", "/light_name", "/light_handle",
+    "/objects", "/handles", "/shadows", "/pusher", "/light", "/light_ray", "/light_name",
     "/episode", "/estimate", "/push", "/goal",
 )  # fmt: skip
 # A browser's own lamp takes the place of the one for all, wherever its other nodes are: the table is dark while a lamp
@@ -33,7 +44,8 @@ _SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 _PUSHER_M = np.array([2 * PUSHER_RADIUS_M, 2 * PUSHER_RADIUS_M, PUSHER_HEIGHT_M])
 PUSHER_NAME, LAMP_NAME = "pusher", "lamp"  # of what is no object
 _MARK_RAD = 0.02  # as seen from the eye, half of the lamp's mark
-_NUDGE = 1e-7  # viser sends nothing that is as it was
+_BALL_M, _BALL_OPACITY = 0.03, 0.12
+_BELOW_M = 0.06  # a hand that takes the lowest light by the lower half of its ball points below the table
 _log = logging.getLogger(__name__)
 Client = viser.ClientHandle | None
 
@@ -87,7 +99,8 @@ class SceneNodes:
         self._lamp = self._scene.add_light_directional(LAMP, intensity=float(np.pi * DIFFUSE), position=start)
         self._marker = LightMarker(self._scene, f"{root}/light")
         self._place_light(np.array(start))
-        self._light_gizmo = None if on_light is None else self._add_light_handle(on_light, start)
+        if on_light is not None:
+            self._let_drag_light(on_light)
 
     def show(self, state: SceneState | None) -> None:
         """Begin with a state of any objects, or clear the table."""
@@ -135,8 +148,6 @@ class SceneNodes:
                 put(self.pusher, state.pusher)
             if not self._is_light_held:
                 self._place_light(state.light.position)
-                if self._light_gizmo is not None:
-                    put(self._light_gizmo, AT * state.light.position)
             self._draw_shadows()
         self._on_change()
 
@@ -158,35 +169,43 @@ class SceneNodes:
     def put_handles_back(self) -> None:
         """Send where the handles are once more: a browser may have moved its own."""
         with self._lock:
-            for handle in (self._light_gizmo, *self._gizmos.values()):
-                if handle is not None:
-                    handle.position = np.asarray(handle.position, float) + _NUDGE
-                    handle.wxyz = np.asarray(handle.wxyz, float) * (1 + _NUDGE)
+            for handle in self._gizmos.values():
+                send_again(handle)
 
-    def _add_light_handle(
-        self, on_light: Callable[[Light, Client], None], start: tuple[float, float, float]
-    ) -> viser.TransformControlsHandle:
-        gizmo = self._scene.add_transform_controls(
-            f"{self._root}/light_handle", scale=0.08, disable_rotations=True, position=start, depth_test=False
+    def _let_drag_light(self, on_light: Callable[[Light, Client], None]) -> None:
+        """Let a hand take hold of the light's mark, and lead it over the dome on which it stands."""
+        # Below the mark, and so where it is; larger than it looks, so that a finger finds it.
+        ball = self._scene.add_icosphere(
+            f"{self._root}/light/ball",
+            _BALL_M,
+            LAMP_COLOUR,
+            opacity=_BALL_OPACITY,
+            cast_shadow=False,
+            receive_shadow=False,
         )
+        is_far = is_beside = False
 
-        async def drag(event: viser.TransformControlsEvent) -> None:
-            light = light_toward(np.asarray(event.target.position))
-            is_over = event.phase == "end"
+        async def drag(event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:
+            nonlocal is_far, is_beside
+            eye, is_over = np.asarray(event.client.camera.position), event.phase == "end"
             with self._lock:  # another thread may be placing what the scene says
+                if event.phase == "start":
+                    mark = AT * np.asarray(self._lamp.position)
+                    is_far, is_beside = bool(mark @ (mark - eye) > 0), False
+                was_beside = is_beside
+                point, is_beside = dome_point(eye, np.asarray(event.end_position, float), is_far=is_far)
+                is_far ^= is_beside and not was_beside  # beyond the edge it comes back on the other side
                 self._is_light_held = not is_over
+                light = light_toward(point)
                 if light is None:
                     return
                 self._place_light(light.position)
                 self._draw_shadows()
-                if is_over:
-                    event.target.position = tuple(AT * light.position)
             self._on_change()
             if is_over:
                 on_light(light, event.client)
 
-        gizmo.on_update(drag)
-        return gizmo
+        ball.on_drag(drag)
 
     def _add_object(self, name: str) -> None:
         try:
@@ -281,6 +300,30 @@ def level_point(
     return point if np.abs(point[:2]).max() <= TABLE_SIDE_M / 2 else None
 
 
+def dome_point(
+    eye: Float[np.ndarray, "3"], through: Float[np.ndarray, "3"], *, is_far: bool
+) -> tuple[Float[np.ndarray, "3"], bool]:
+    """Return where a ray from the eye through a point meets the dome of the lights' marks, and whether it passes by.
+
+    With u the direction of the ray, f = eye - (eye . u) u is nearest to the table's centre, and the ray meets the
+    dome's sphere of radius r at f -+ sqrt(r^2 - |f|^2) u. Beside the sphere, the point of it that is nearest counts.
+
+    Args:
+        eye: where the ray begins [m].
+        through: a point on it [m].
+        is_far: whether the far one of two points counts, unless it is far below the table; before an eye that is in
+            the dome there is no other.
+    """
+    way = (through - eye) / max(float(np.linalg.norm(through - eye)), 1e-9)
+    nearest = eye - (eye @ way) * way
+    half_m = np.sqrt(max(AT**2 - float(nearest @ nearest), 0.0))
+    if half_m == 0.0:
+        return AT * nearest / np.linalg.norm(nearest), True
+    near, far = nearest - half_m * way, nearest + half_m * way
+    is_inside = bool(eye @ eye < AT**2)
+    return (far if is_inside or (is_far and far[2] >= -_BELOW_M) else near), False
+
+
 def extent_m(
     state: SceneState, library: AssetLibrary, goal: Sequence[tuple[str, Pose]] = ()
 ) -> Float[np.ndarray, "P 3"]:
@@ -295,7 +338,7 @@ def extent_m(
     if state.pusher is not None:
         corners.append(state.pusher + _PUSHER_M / 2 * _SIGNS)
     for name, pose in (*((name, state.pose(name)) for name in state.names), *goal):
-        corners.append(pose.apply(_size_m(library, name) / 2 * _SIGNS))
+        corners.append(pose.apply(size_m(library, name) / 2 * _SIGNS))
     return np.concatenate(corners)
 
 
@@ -313,28 +356,21 @@ def pointed_at(
     mark = AT * state.light.position - eye
     if mark @ way > np.cos(_MARK_RAD) * np.linalg.norm(mark) * np.linalg.norm(way):
         return LAMP_NAME
-    boxes = [(name, state.pose(name), _size_m(library, name)) for name in state.names]
+    boxes = [(name, state.pose(name), size_m(library, name)) for name in state.names]
     if state.pusher is not None:
         boxes.append((PUSHER_NAME, Pose(state.pusher, NO_TURN), _PUSHER_M))
-    met = {name: at for name, pose, size_m in boxes if np.isfinite(at := _enters(pose, size_m, eye, way))}
+    met = {name: at for name, pose, sides_m in boxes if np.isfinite(at := _enters(pose, sides_m, eye, way))}
     return min(met, key=met.__getitem__, default=None)
 
 
-def _enters(pose: Pose, size_m: np.ndarray, eye: np.ndarray, way: np.ndarray) -> float:
+def _enters(pose: Pose, sides_m: np.ndarray, eye: np.ndarray, way: np.ndarray) -> float:
     """Where a ray enters a box around a pose, in lengths of the ray; infinite if it misses (Kay and Kajiya 1986)."""
     axes = quaternion_to_matrix(pose.quaternion)
     start, slope = (eye - pose.position) @ axes, way @ axes
     with np.errstate(divide="ignore", invalid="ignore"):
-        sides = np.stack([(-size_m / 2 - start) / slope, (size_m / 2 - start) / slope])
+        sides = np.stack([(-sides_m / 2 - start) / slope, (sides_m / 2 - start) / slope])
     near, far = np.nanmax(sides.min(axis=0)), np.nanmin(sides.max(axis=0))
     return float(near) if 0 < near <= far else np.inf
-
-
-def _size_m(library: AssetLibrary, name: str) -> np.ndarray:
-    try:
-        return library.size_m(name)
-    except OsfError:  # removed since
-        return np.full(3, UNKNOWN_M)
 
 
 def light_toward(position: np.ndarray) -> Light | None:

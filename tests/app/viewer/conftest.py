@@ -47,12 +47,15 @@ class ViewerDriver:
             for callback in handles._impl_aux.update_cb:
                 asyncio.run(callback(SimpleNamespace(client=self.client, target=handles, phase=phase)))
 
-    def drag_body(self, path, eye, grip, to):
+    def drag_body(self, path, eye, grip, to, *phases):
         """Take hold of a node itself where it is seen from an eye, and let it go elsewhere."""
-        camera = SimpleNamespace(camera=SimpleNamespace(position=eye), add_notification=lambda *_, **__: None)
+        someone = SimpleNamespace(add_notification=lambda *_, **__: None)
+        client = self.client if isinstance(self.client, SimpleNamespace) else someone
+        client.camera = SimpleNamespace(position=eye)
         node = self.node(path)
-        for phase, end in (("start", grip), ("update", to), ("end", to)):
-            event = SimpleNamespace(client=camera, target=node, phase=phase, start_position=grip, end_position=end)
+        for phase in phases or ("start", "update", "end"):
+            end = grip if phase == "start" else to
+            event = SimpleNamespace(client=client, target=node, phase=phase, start_position=grip, end_position=end)
             for entry in node._impl.drag_cb:
                 asyncio.run(entry.callback(event))
 

@@ -1,5 +1,6 @@
 """Views of single pages, with browsers that speak viser's protocol through the relay."""
 
+import contextlib
 import gc
 import threading
 import time
@@ -10,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 import viser
+import zstandard
 from websockets.sync.client import connect
 
 from app.episodes.trajectory import ReplayClock, read_trajectory
@@ -60,6 +62,17 @@ class Page:
         view = Camera.look_at("view", eye, at).T_world_camera
         seen = {"position": eye.tolist(), "look_at": at.tolist(), "wxyz": view.quaternion.tolist()}
         self.send(msgspec.msgpack.encode({**CAMERA, **seen}))
+
+    def told_about(self, path):
+        """Kinds of messages about a node that have come since this was asked for last."""
+        kinds = set()
+        with contextlib.suppress(TimeoutError):
+            while True:
+                frame = self._socket.recv(timeout=0.3)
+                packed = frame[16 : 16 + int.from_bytes(frame[8:16], "little")]
+                content = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed))
+                kinds |= {message["type"] for message in content["messages"] if message.get("name") == path}
+        return kinds
 
     @property
     def client(self):
@@ -190,6 +203,26 @@ def test_a_page_that_only_watches_moves_its_camera_and_nothing_else(live, browse
             until(lambda: np.isclose(body.position[2], 0.7))
     finally:
         driver.leave("drives")
+
+
+@pytest.mark.parametrize("handles", [f"/handles/{BOX}", f"/goal/objects/{BOX}"])
+def test_handles_that_a_watcher_moved_in_its_own_browser_go_back(live, shown, handles):
+    end = msgspec.msgpack.encode({"type": "TransformControlsDragEndMessage", "name": handles, "owner": ""})
+    driver, told = live.services.driver, set()
+    live.request("POST", "/api/goals/draft", {"scene": None})
+    until(lambda: live.services.viewer.server.scene.get_handle_by_name(handles))
+    try:
+        driver.arrive("drives")
+        with opened(live, "watches") as page:
+            until(lambda: "TransformControlsMessage" in page.told_about(handles))
+            until(lambda: not page.told_about(handles))  # all that was there before has come
+            page.send(end)
+            until(
+                lambda: told.update(page.told_about(handles)) or told >= {"SetPositionMessage", "SetOrientationMessage"}
+            )
+    finally:
+        driver.leave("drives")
+        live.request("DELETE", "/api/goals/draft")
 
 
 def test_a_chosen_goal_is_golden_on_the_live_table_alone(live, shown):

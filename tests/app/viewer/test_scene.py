@@ -1,15 +1,19 @@
 """The table in the 3D view: what is drawn where, what hands move, its light and shadows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from app.viewer.nodes.room import AT, CHARACTER, LINE, VIEW_AT, VIEW_FOV_RAD, VIEW_FROM, framing, separated
 from app.viewer.nodes.scene_nodes import (
     LAMP_NAME,
     PUSHER_NAME,
+    SceneNodes,
     clipped,
+    dome_point,
     level_point,
     light_toward,
     pointed_at,
@@ -82,13 +86,35 @@ def test_dragged_objects_turn_about_the_axes_of_the_table(live, browser, shown):
     until(lambda: np.allclose(gizmo.wxyz, [1, 0, 0, 0]) and np.allclose(gizmo.position, body.position))
 
 
+BALL, ABOVE = "/light/ball", np.array([0.0, 0.0, 2.0])
+
+
 def test_a_dragged_light_lights_the_scene_when_let_go(live, browser, shown):
     until(lambda: browser.table_agrees(shown))
-    browser.drag("/light_handle", [0, 3, 4], None, "start", "update")
+    before, after = AT * np.array(shown["light"]["position"]), AT * np.array([0, 0.6, 0.8])
+    browser.drag_body(BALL, ABOVE, before, after, "start", "update")
     assert np.allclose(browser.node("/lamp").position, [0, 0.6, 0.8])
-    browser.drag("/light_handle", None, None, "end")
+    browser.drag_body(BALL, ABOVE, before, after, "end")
     until(lambda: np.allclose(live.request("GET", f"/api/scenes/{shown['id']}")[1]["light"]["position"], [0, 0.6, 0.8]))
     until(lambda: np.allclose(browser.node("/lamp").position, [0, 0.6, 0.8]))  # older changes may be drawn before
+
+
+def test_a_light_that_somebody_holds_goes_back_when_another_takes_over(live, browser, shown):
+    until(lambda: browser.table_agrees(shown))
+    light = shown["light"]["position"]
+    browser.drag_body(BALL, ABOVE, AT * np.array(light), AT * np.array([0, 0.6, 0.8]), "start", "update")
+    assert not np.allclose(browser.node("/lamp").position, light)
+    driver = live.services.driver
+    try:
+        driver.arrive("another")
+        until(lambda: np.allclose(browser.node("/lamp").position, light))
+    finally:
+        driver.leave("another")
+
+
+@pytest.fixture
+def table(server, library):
+    return SceneNodes(server, library, lambda *_: None, lambda *_: None)
 
 
 CUBE = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (0, 2)], float) * 0.05
@@ -177,6 +203,43 @@ def test_a_ray_meets_what_is_nearest(library):
     assert meets(0.3, 0.0, 0.1) is None
     assert pointed_at(scene, library, eye, np.array([0.0, -1.0, 0.0])) is None  # all is behind
     assert pointed_at(scene, library, np.array([0.0, 2.0, 0.1]), np.array([0.0, -1.0, 0.0])) == BOTTLE
+
+
+on_dome = st.builds(Light.from_angles, st.floats(-np.pi, np.pi), st.floats(0.0873, 1.57)).map(
+    lambda light: AT * light.position
+)
+eyes = st.tuples(st.floats(-1, 1), st.floats(-2, -0.8), st.floats(0.2, 2)).map(np.array)
+
+
+@given(on_dome, eyes, st.floats(0.1, 3))
+def test_a_hand_that_points_at_the_dome_meets_it_there(mark, eye, share):
+    through = eye + share * (mark - eye)
+    point, is_beside = dome_point(eye, through, is_far=bool(mark @ (mark - eye) > 0))
+    np.testing.assert_allclose(point, mark, atol=1e-4)  # where it only touches the dome, both points are one
+    assert not is_beside or abs(mark @ (mark - eye)) < 1e-3
+
+
+@given(eyes, st.tuples(*[st.floats(-1, 1)] * 3).map(np.array), st.booleans())
+def test_wherever_a_hand_points_the_mark_stays_on_the_dome(eye, through, is_far):
+    assume(np.linalg.norm(through - eye) > 1e-3)
+    point, is_beside = dome_point(eye, through, is_far=is_far)
+    assert np.linalg.norm(point) == pytest.approx(AT)
+    way = (through - eye) / np.linalg.norm(through - eye)
+    from_ray = np.linalg.norm(np.cross(point - eye, way))
+    from_centre = np.linalg.norm(np.cross(eye, way))
+    assert from_ray == pytest.approx(max(from_centre - AT, 0.0), abs=1e-6)  # no point of the dome is nearer
+    assert is_beside == (from_ray > 1e-9) or from_ray < 1e-6
+
+
+def test_led_over_the_edge_of_the_dome_a_light_goes_behind_it(table, driver):
+    front, behind = AT * np.array([0.0, -0.6, 0.8]), AT * np.array([0.0, 0.8, 0.6])
+    table.show(replace(record().state, light=Light(front)))
+    eye, lamp = np.array(VIEW_FROM), driver.node("/lamp")
+    driver.drag_body(BALL, eye, front, behind, "start", "update")
+    assert lamp.position[1] < 0.5  # that spot is before the dome, too
+    driver.drag_body(BALL, eye, front, behind + [0.0, 0.5, 1.0], "update")
+    driver.drag_body(BALL, eye, front, behind, "update", "end")
+    np.testing.assert_allclose(lamp.position, behind / AT, atol=1e-6)
 
 
 def test_an_object_is_dragged_over_the_table_until_a_goal_is_composed(live, browser, shown):

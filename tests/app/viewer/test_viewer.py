@@ -27,14 +27,15 @@ def test_a_dropped_object_falls_and_one_in_another_goes_back(live, browser, show
         assert put_back["quaternion"] == pytest.approx(lying["quaternion"], abs=1e-3)
 
 
-def test_a_goal_is_composed_with_handles_of_its_own(live, browser, shown):
+def test_a_goal_is_composed_with_copies_of_its_own(live, browser, shown):
     until(lambda: all(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
     live.request("POST", "/api/goals/draft", {"scene": None})
     until(lambda: browser.below("/goal/objects") == {BOX, BOTTLE})
     until(lambda: not any(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
     copy = f"/goal/objects/{BOX}"
-    aside = np.array(browser.node(copy).position) + [0.03, 0, 0]
-    browser.drag(copy, aside)
+    at = np.array(browser.node(copy).position)
+    aside = at + [0.03, 0, 0]
+    browser.drag_body(f"{copy}/shape", at + [0, 0, 1], at, aside)
     until(lambda: np.allclose(browser.node(copy).position, aside, atol=2e-3))
     assert live.request("GET", f"/api/scenes/{shown['id']}")[1]["objects"] == shown["objects"]  # only the copy moves
     live.request("DELETE", "/api/goals/draft")
