@@ -27,6 +27,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.world.imaging import TABLE_ALBEDO
 from tests.app.conftest import until
+from tests.app.storage.test_database import record
 from tests.app.viewer.conftest import BOTTLE, BOX
 
 
