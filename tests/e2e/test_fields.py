@@ -99,6 +99,7 @@ def test_an_uploaded_set_is_shown_trained_and_says_that_it_needs_a_mesh(page, ur
     assert page.input_value('#new-field input[name="name"]') == "my_egg"
     page.fill('#new-field input[name="minutes"]', "0.1")
     page.click("#new-field [type=submit]")
+    wait_until(lambda: page.inner_text("#training-title") == "my_egg")  # not the training before
     wait_until(lambda: page.get_attribute("#training", "data-state") in ("done", "failed"), TRAIN_S)
     entry = page.locator('#field-list [data-field="my_egg"]')
     entry.wait_for(timeout=WAIT_MS)
