@@ -51,7 +51,7 @@ _ROUTERS = (
     status.router, status.storage_router, objects.router, fields.router, scenes.router, scenes.neural_router,
     page.presets_router, page.stories_router, goals.router, photos.router, photos.pictures_router,
     photos.calibration_router, episodes.router,
-    estimates.router, predictions.router, jobs.router, events.router,
+    estimates.router, predictions.router, predictions.push_router, jobs.router, events.router,
 )  # fmt: skip
 _OPEN_ROUTERS = (page.driver_router, page.views_router, robot.router, relay.router)  # of one page, or for anybody
 _OTHER_MODELS = (

@@ -30,7 +30,7 @@ from app.services.goals import GoalChecks, Goals
 from app.services.look_outlines import Outliner
 from app.services.objects import OwnObjects, Thumbnails
 from app.services.photos import BoardPhotos, PhotoTables, TablePhotos
-from app.services.pushes import Predictions
+from app.services.pushes import Predictions, Pushes
 from app.services.robot import RobotTable
 from app.services.runner import DemoScene, Runner
 from app.services.service_settings import Settings
@@ -208,6 +208,7 @@ class Services:
         predictor = ProcessClient(predictor_main, (data_dir,), "predictor of pushes")
         stack.callback(predictor.stop)
         self.predictions = Predictions(self.runner.scenes, self.fields.names, predictor)
+        self.pushes = Pushes(self.runner.scenes, self.predictions, self.runner.hub)
         reader = PhotoReader()
         stack.callback(reader.stop)
         self.goals = Goals(self.runner, data_dir, settings.max_goals, reader)
@@ -218,7 +219,7 @@ class Services:
         self.photos.start()
         self.photo_tables = PhotoTables(self.runner, self.photos, self.goals, self.neural)
         self.board_photos = BoardPhotos(self.photos.looker.ask)
-        self.viewer = Viewer(self.runner, self.neural, self.fields.names, self.predictions, self.goals)
+        self.viewer = Viewer(self.runner, self.neural, self.fields.names, self.pushes, self.goals)
         stack.callback(self.viewer.stop)
         self.viewer.start()
         self.thumbnails = Thumbnails(self.runner.library, data_dir / "thumbnails")

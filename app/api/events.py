@@ -24,6 +24,7 @@ from app.api.goals import DraftOut
 from app.api.jobs import JobOut
 from app.api.models import Visitor
 from app.api.page import DriverOut
+from app.api.predictions import PushOut
 from app.api.problems import problems
 from app.api.scenes import scene_out
 from app.jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
@@ -33,6 +34,7 @@ from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene, Notice
 from app.services.goals import Draft, DraftChanged, GoalsChanged
 from app.services.photos import PhotosChanged
+from app.services.pushes import Push, PushChanged
 from app.storage.paths import without_places
 from osfcore.control.events import Looking
 from osfcore.errors import OsfError, UnknownName
@@ -136,13 +138,14 @@ class DepartureMiddleware:
 
 
 class Mailbox:
-    """What has not been sent to one page yet: all jobs and notices, but only the latest scene and images."""
+    """What has not been sent to one page yet: all jobs and notices, but only the latest of what is drawn anew."""
 
     def __init__(self, current: str | None) -> None:
         self._loop = asyncio.get_running_loop()
         self._current = current
         self.letters: deque[Letter] = deque(maxlen=_MAX_WAITING)
         self.draft: DraftChanged | None = None
+        self.push: PushChanged | None = None
         self.is_scene_new = True
         self.frames: FramesTaken | None = None
         self.look: Looking | None = None
@@ -165,6 +168,8 @@ class Mailbox:
                 self.letters.append(event)
             case DraftChanged():
                 self.draft = event
+            case PushChanged():
+                self.push = event
             case CurrentScene(record):
                 self._current = None if record is None else record.id
                 self.is_scene_new, self.frames, self.look = True, None, None
@@ -185,7 +190,7 @@ async def stream(
     visitor: Annotated[Visitor | None, Query(description="What the page calls itself.")] = None,
     last_event_id: Annotated[str | None, Header(description="Number of the last job event that was seen.")] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Follow what happens: job, look, forgotten, scene, frame, goals, photos, draft, driver, notice."""
+    """Follow what happens: job, look, forgotten, scene, frame, goals, photos, draft, push, driver, notice."""
     mailbox = Mailbox(services.runner.scenes.current)
     with ExitStack() as departure:
         departure.callback(services.runner.hub.subscribe(mailbox.put))
@@ -201,6 +206,8 @@ async def stream(
             yield ServerSentEvent(event="notice", data=NoticeEvent(level="warning", text=entry.sentence))
         if services.goals.draft is not None:
             yield _draft_event(services, services.goals.draft)
+        if services.pushes.current is not None:
+            yield await run_in_threadpool(_push_event, services, services.pushes.current)
         last = 0
         if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
             last = min(int(last_event_id[:19]), _MAX_EVENT)
@@ -238,6 +245,9 @@ async def _follow(
         if mailbox.draft is not None:
             changed, mailbox.draft = mailbox.draft, None
             yield _draft_event(services, changed.draft)
+        if mailbox.push is not None:
+            tried, mailbox.push = mailbox.push, None
+            yield await run_in_threadpool(_push_event, services, tried.push)
         now = time.monotonic()
         if mailbox.is_scene_new and now >= scene_at:
             mailbox.is_scene_new, scene_at = False, now + SCENE_INTERVAL_S
@@ -327,6 +337,12 @@ def _draft_event(services: Services, draft: Draft | None) -> ServerSentEvent:
     if draft is None:
         return ServerSentEvent(event="draft", raw_data="null")
     return ServerSentEvent(event="draft", data=DraftOut.of(draft, services.objects.labels()))
+
+
+def _push_event(services: Services, push: Push | None) -> ServerSentEvent:
+    if push is None:
+        return ServerSentEvent(event="push", raw_data="null")
+    return ServerSentEvent(event="push", data=PushOut.of(services, push))
 
 
 def _look(services: Services, look: Looking) -> LookEvent:

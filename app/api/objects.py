@@ -17,7 +17,7 @@ from app.api.problems import named_in_path, problems
 from app.jobs.params import ObjectName
 from osfcore.errors import OsfError
 from osfcore.objects.catalogue import CATALOGUE
-from osfcore.objects.fetch import DEFAULT_NAMES, MAX_MASS_KG, NewObject
+from osfcore.objects.fetch import MAX_MASS_KG, NewObject
 
 
 class SymmetryOut(BaseModel):
@@ -38,8 +38,7 @@ class ObjectOut(BaseModel):
     licence: str
     attribution: str
     available: bool = Field(description="Whether it is on this machine and can be used in scenes.")
-    own: bool = Field(description="Whether it was added here, and can be deleted.")
-    fetchable: bool = Field(description="Whether a job of the kind fetch_assets can bring it here.")
+    own: bool = Field(description="Whether it was added here, and can be deleted; others are fetched.")
     version: str | None = Field(description="Changes with its looks and facts; null until it is on this machine.")
 
 
@@ -140,6 +139,5 @@ def _object(services: Services, name: str, *, is_there: bool) -> ObjectOut:
         attribution=info.attribution,
         available=size_m is not None,
         own=name not in CATALOGUE,
-        fetchable=name in DEFAULT_NAMES,
         version=version,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Path
+from fastapi import APIRouter, Path, Query
 from pydantic import BaseModel, Field
 
 from app.api.bodies import BoundedRoute
@@ -51,6 +51,9 @@ views_router = APIRouter(prefix="/api/views", tags=["views"], responses=problems
 VisitorPath = Annotated[Visitor, Path(description="What the page calls itself.")]
 
 
+Share = Annotated[float, Query(ge=0, le=1, description="Share of the view, from its left or its top.")]
+
+
 class ReplayIn(Input):
     """A recorded course on view in place of the live table: give either an episode or a story."""
 
@@ -81,6 +84,7 @@ class ViewIn(Input):
     )
 
     goal: str | None = Field(None, description="Goal whose objects are drawn in gold on the live table, if known.")
+    handles: bool = Field(False, description="Whether objects have handles to lift and turn them.")
 
 
 class ViewOut(BaseModel):
@@ -95,13 +99,25 @@ def show(services: ServicesDep, visitor: VisitorPath, body: ViewIn) -> ViewOut:
     with named_in_path():
         replay = None if body.replay is None else body.replay.replay(services)
         goal = None if body.goal is None else services.goals.get(body.goal)
-    return ViewOut(is_open=services.viewer.pages.ask(visitor, Wish(replay, body.shows, goal)))
+    return ViewOut(is_open=services.viewer.pages.ask(visitor, Wish(replay, body.shows, goal, body.handles)))
 
 
 @views_router.post("/{visitor}/camera", status_code=204)
 def frame(services: ServicesDep, visitor: VisitorPath) -> None:
     """Place the camera of one page's 3D view anew, so that the objects fill it."""
     services.viewer.pages.frame(visitor)
+
+
+class PointedOut(BaseModel):
+    """What is at a place in a view."""
+
+    name: str | None = Field(description='Of an object, "pusher", "lamp", or null for nothing of these.')
+
+
+@views_router.get("/{visitor}/pointed")
+def pointed(services: ServicesDep, visitor: VisitorPath, x: Share, y: Share) -> PointedOut:
+    """Name what stands at a place in one page's 3D view."""
+    return PointedOut(name=services.viewer.pages.pointed_at(visitor, x, y))
 
 
 presets_router = APIRouter(prefix="/api/presets", tags=["presets"], responses=problems(), route_class=BoundedRoute)

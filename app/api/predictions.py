@@ -1,27 +1,30 @@
-"""What would a push do? Answered at once, for many pushes at a time."""
+"""What would a push do? Answered at once for many pushes at a time, and tried one by one on the table that is shown."""
 
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Response
-from pydantic import BaseModel, FailFast, Field
+from pydantic import BaseModel, FailFast, Field, FiniteFloat
 
 from app.api.bodies import BoundedRoute
-from app.api.dependencies import ServicesDep
+from app.api.dependencies import Services, ServicesDep, slow
 from app.api.models import Excerpt, Input, Position, Quaternion, Vector3, Velocity
 from app.api.problems import problems
 from app.jobs.params import ObjectName
 from app.processes.messages.neural_messages import Predicted
 from app.processes.messages.scene_messages import SceneRecord
+from app.services.pushes import SPEED_M_S, NoPush, Push, PushState
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import MAX_HORIZON, check_actions
 from osfcore.geometry.states import MAX_OBJECTS, SceneState
+from osfcore.geometry.workspace import MAX_SPEED_M_S
 from osfcore.io.scene_file import rollouts_to_json
 from osfcore.paper.method import Method
 
@@ -102,6 +105,65 @@ class PredictionOut(BaseModel):
 
 
 MAX_POSES = 100_000  # some 8 MB of JSON
+
+
+class PushIn(Input):
+    """A push to try from where the pusher is."""
+
+    target: list[FiniteFloat] | None = Field(
+        None,
+        min_length=2,
+        max_length=2,
+        description="Where the pusher is to go, (x, y) [m]; null for beyond the nearest object.",
+    )
+    speed: float = Field(SPEED_M_S, ge=0.05, le=MAX_SPEED_M_S, description="Not to be exceeded [m/s].")
+
+
+class OutcomeOut(BaseModel):
+    """What a push does to an object; what it did is null before it is executed."""
+
+    name: str
+    label: str
+    predicted_mm: float = Field(description="How far it is predicted to go.")
+    predicted_deg: float = Field(description="How far it is predicted to turn.")
+    went_mm: float | None
+    turned_deg: float | None
+    off_mm: float | None = Field(description="Between where it was predicted and where it is.")
+    off_deg: float | None = Field(description="Likewise, between orientations that look different.")
+
+
+class PushOut(BaseModel):
+    """The push that is tried, the same for all visitors."""
+
+    scene: str
+    revision: int = Field(description="Of the scene from which it starts.")
+    state: PushState = Field(description='"outdated" once the table has changed otherwise.')
+    problem: str = Field(description="Why there is no prediction; empty if there is one, or will be.")
+    actions: Sequence
+    is_warm: bool = Field(description="Whether the network is loaded; the first prediction waits for it.")
+    took_s: float = Field(description="Time that predicting took [s].")
+    objects: list[OutcomeOut] = Field(description="Empty before it is predicted.")
+
+    @staticmethod
+    def of(services: Services, push: Push) -> PushOut:
+        """From the service's own."""
+        labels = services.objects.labels()
+        rows = [
+            OutcomeOut(label=labels.get(row.name, row.name), **dataclasses.asdict(row))
+            for row in push.outcomes(services.runner.library)
+        ]
+        return PushOut(
+            scene=push.record.id,
+            revision=push.record.revision,
+            state=push.state,
+            problem=push.problem,
+            actions=push.actions.tolist(),
+            is_warm=services.pushes.is_warm,
+            took_s=push.took_s,
+            objects=rows,
+        )
+
+
 _ANSWER: dict[int | str, dict[str, Any]] = {200: {"model": PredictionOut, "description": "The predicted futures."}}
 router = APIRouter(prefix="/api/predictions", tags=["predictions"], route_class=BoundedRoute)
 
@@ -155,3 +217,38 @@ def _json(answer: Predicted, record: SceneRecord | None) -> bytes:
         "revision": None if record is None else record.revision,
     }
     return json.dumps(body, allow_nan=False, separators=(",", ":")).encode()
+
+
+push_router = APIRouter(prefix="/api/push", tags=["predictions"], responses=problems(), route_class=BoundedRoute)
+
+
+@push_router.get("", responses=problems(404))
+def get_push(services: ServicesDep) -> PushOut:
+    """Return the push that is tried."""
+    push = services.pushes.current
+    if push is None:
+        raise NoPush
+    return PushOut.of(services, push)
+
+
+@push_router.put("", responses=problems(409, 503))
+def predict_push(services: ServicesDep, body: PushIn) -> PushOut:
+    """Choose a push on the table that is shown, and predict it; nothing moves. Events of kind "push" bring the rest."""
+    target = None if body.target is None else np.array(body.target)
+    return PushOut.of(services, services.pushes.predict(target, body.speed))
+
+
+@push_router.post("/execute", responses=problems(404, 409, 503))
+@slow
+def execute_push(services: ServicesDep) -> PushOut:
+    """Carry out the push that was predicted, and compare."""
+    push = services.pushes.execute()
+    if push is None:  # dropped meanwhile
+        raise NoPush
+    return PushOut.of(services, push)
+
+
+@push_router.delete("", status_code=204)
+def drop_push(services: ServicesDep) -> None:
+    """Forget the push that is tried; nothing moves back."""
+    services.pushes.drop()

@@ -32,7 +32,7 @@ from app.services.goals import DraftUnsound, GoalRefused, NoDraft, NoPhoto, NoTa
 from app.services.image_sets import TooManySets
 from app.services.objects import CatalogueObject, ObjectNeeded, ObjectTaken
 from app.services.photos import NotFoundYet, NothingMarked, PhotoDoubtful
-from app.services.pushes import NothingToPush
+from app.services.pushes import CannotExecute, NoPush, NothingToPush
 from app.services.robot import NoPicture, NoRobot, NothingAsked, RobotBusy
 from app.services.runner import SceneNeeded, SetInUse, TrainingAlready, WorkshopInUse
 from app.services.scenes import SceneHeld, TooManyScenes
@@ -41,7 +41,6 @@ from app.storage.paths import without_places
 from app.storage.records import TooManyGoals, TooManyPhotos
 from app.storage.uploads import UploadNotStored, UploadRefused
 from app.storage.usage import StorageFull
-from app.viewer.push_panel import CannotExecute
 from osfcore.contrib.robots.robot import ConnectionLost, RobotRefused, RobotStopped
 from osfcore.errors import (
     CannotWrite,
@@ -106,7 +105,7 @@ class NotFound(OsfError):
 
 
 _ERRORS: dict[int, tuple[type[OsfError], ...]] = {
-    404: (NotFound, NoRobot, NoPicture, NoDraft, NoImages),
+    404: (NotFound, NoRobot, NoPicture, NoDraft, NoImages, NoPush),
     409: (
         CannotExecute, CatalogueObject, CorruptFile, DraftUnsound, EpisodeGoesOn, GoalRefused, GoalUnknown,
         MissingAssets, MissingExtra, MissingFields, NoClip, NoPhoto, NoPhotographedTable, NoPrior, NoPublishedField,

@@ -49,8 +49,8 @@ class AssetsFetch(DataCommand):
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Objects such as 006_mustard_bottle; none: all that the source offers."""
     source: str = "pypi"
-    """"pypi" (ten objects), a folder with NAME/google_16k/textured.obj, or the http(s) address of such a folder or of
-    the archives NAME_google_16k.tgz."""
+    """"pypi" (ten objects), "ycb" (the official download; name what you want), a folder with
+    NAME/google_16k/textured.obj, or the http(s) address of such a folder or of the archives NAME_google_16k.tgz."""
     workers: int = 2
     """Processes that convert meshes; 1 converts in this one."""
     force: bool = False

@@ -23,7 +23,6 @@ from app.processes.messages.neural_messages import (
     DrawPhoto,
     DrawView,
     Order,
-    RecogniseTable,
 )
 from app.processes.render_cameras import bands
 from app.processes.server import IsOvertaken, ProcessServer
@@ -65,7 +64,7 @@ class NeuralRenderer:
 
     def render(
         self, order: Order, is_overtaken: IsOvertaken = lambda: False
-    ) -> DrawnView | Comparison | ContentCheck | bytes | bool | None:
+    ) -> DrawnView | Comparison | ContentCheck | bytes | None:
         """What answers an order; None if it was overtaken on the way.
 
         Raises:
@@ -81,8 +80,6 @@ class NeuralRenderer:
                 return self._photograph(order)
             case CheckPhoto():
                 return self._check(order)
-            case RecogniseTable():
-                return self._recognise(order)
             case _:
                 raise TypeError(f"{type(order).__name__} is no picture")
 
@@ -123,11 +120,6 @@ class NeuralRenderer:
         image = _decoded(order.photo)[None] / np.float32(255)
         observation = Observation((order.camera,), image, order.state.names, None, None, 0.0)
         return self._checker(*self._key(order.state.names)).check(observation, order.state)
-
-    def _recognise(self, order: RecogniseTable) -> bool:
-        from osfcore.estimation.content_check import is_goal_view
-
-        return is_goal_view(self._fields.load_table(), _decoded(order.picture) / np.float32(255), order.camera)
 
     def _picture(
         self, state: SceneState, camera: Camera, quality: Quality, outputs: set[str]

@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from app.processes.client import ProcessClient, ProcessUnavailable
-from app.processes.messages.neural_messages import CheckPhoto, RecogniseTable
+from app.processes.messages.neural_messages import CheckPhoto
 from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
 from app.services.fields import FieldCatalogue, MissingFields
 from app.services.runner import Runner
@@ -24,6 +24,7 @@ from app.storage.database import now_utc
 from app.storage.photos import Photo, PhotoCrop, PhotoReader, central_crop, check_crop, cut_out
 from app.storage.records import GoalRecord, GoalStore, PhotoRecord, Poses, Source
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName, check_known
+from osfcore.estimation.goal_view import is_goal_view
 from osfcore.estimation.steps import ContentCheck, Verdict
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
@@ -416,17 +417,10 @@ class GoalChecks:
         return GoalCheck(verdict, _TEXTS[verdict].format(objects=self._listed(table.state.names)))
 
     def is_goal_view(self, photo: Photo) -> bool:
-        """Whether the middle of a picture shows the table as the goal camera sees it, from whatever it holds.
-
-        Raises:
-            ProcessUnavailable: if what looks at photos has died.
-        """
+        """Whether the middle of a picture shows the table as the goal camera sees it, from whatever it holds."""
         camera = goal_camera()
         pixels = cut_out(photo, central_crop(photo.width, photo.height, camera), camera)
-        seen_by = camera.resized(pixels.shape[1], pixels.shape[0])
-        answer = self._link.call(RecogniseTable(uuid.uuid4().hex, seen_by, _encoded(pixels, "PNG")))
-        assert isinstance(answer, bool)
-        return answer
+        return is_goal_view(self._fields.load_table(), pixels / np.float32(255), camera)
 
     def require(self, goal: str, scene: str) -> None:
         """Refuse a goal that makes no sense for a table.

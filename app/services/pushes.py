@@ -1,19 +1,24 @@
-"""Pushes as people think of them: a way to go at some speed, and what came of it."""
+"""Pushes as people think of them: a way to go at some speed, what is predicted of it, and what came of it."""
 
 from __future__ import annotations
 
+import logging
+import threading
 import uuid
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from app.processes.client import ProcessClient
-from app.processes.messages.neural_messages import NeuralAnswer, PredictPushes
-from app.processes.messages.scene_messages import SceneRecord
+from app.processes.messages.neural_messages import NeuralAnswer, Predicted, PredictPushes
+from app.processes.messages.scene_messages import SceneChanged, SceneRecord
 from app.services.estimates import errors_of
+from app.services.event_hub import CurrentScene, Hub
 from app.services.fields import MissingFields
 from app.services.scenes import Scenes, scene_or_current
 from osfcore.errors import InvalidInput, OsfError
@@ -25,8 +30,13 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.method import Method
 
 MAX_ACTIONS = 50
+SPEED_M_S = 0.25  # of a push, unless another is asked for
 _STILL_M = 1e-9
 _BEYOND_M = 0.05
+_KEY = "push"
+PushState = Literal["predicting", "predicted", "executing", "executed", "refused", "outdated"]
+_CHANGED = "The table has changed; predict again."
+_log = logging.getLogger(__name__)
 
 
 def toward(start: Float[np.ndarray, "2"], target: Float[np.ndarray, "2"], speed_m_s: float) -> Float[np.ndarray, "T 3"]:
@@ -107,10 +117,10 @@ def outcomes(
 
 
 class NothingToPush(OsfError):
-    """There is no scene from which a prediction could start."""
+    """There is no scene from which a prediction could start, or nothing in it."""
 
-    def __init__(self) -> None:
-        super().__init__("There is no scene to predict; make one, or send a state.")
+    def __init__(self, why: str = "There is no scene to predict; make one, or send a state.") -> None:
+        super().__init__(why)
 
 
 class Predictions:
@@ -170,3 +180,196 @@ class Predictions:
         if missing := [name for name in state.names if name not in known]:
             raise MissingFields(missing)
         return self._link.submit(PredictPushes(key or uuid.uuid4().hex, state, actions, before, method))
+
+
+# The push that somebody tries
+
+
+class NoPush(OsfError):
+    """No push is chosen."""
+
+    def __init__(self) -> None:
+        super().__init__("No push is chosen; drag the pusher at an object first.")
+
+
+class CannotExecute(OsfError):
+    """Actions that may not be executed now."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Push:
+    """A push that somebody has chosen, the same for all visitors.
+
+    Attributes:
+        record: the scene from which it starts.
+        actions: equal velocities of the pusher [m/s].
+        state: how far it is; "outdated" once the table has changed otherwise.
+        problem: why there is no prediction; empty if there is one, or will be.
+        rollouts: what the actions were predicted to lead to.
+        took_s: time that predicting took [s].
+        truth: the way things truly went, as far as it has been executed.
+    """
+
+    record: SceneRecord
+    actions: Float[np.ndarray, "T 3"]
+    state: PushState = "predicting"
+    problem: str = ""
+    rollouts: Rollouts | None = None
+    took_s: float = 0.0
+    truth: tuple[SceneState, ...] = ()
+
+    @property
+    def way(self) -> Float[np.ndarray, "2 2"]:
+        """Where the pusher starts and ends [m]."""
+        assert self.record.state.pusher is not None
+        start = self.record.state.pusher[:2]
+        return np.stack([start, start + STEP_S * self.actions[:, :2].sum(axis=0)])
+
+    def outcomes(self, library: AssetLibrary) -> tuple[Outcome, ...]:
+        """What it does to each object, against the truth once it is executed; empty before it is predicted."""
+        if self.rollouts is None:
+            return ()
+        after = self.truth[-1] if self.state == "executed" else None
+        return outcomes(self.record.state, self.rollouts, after, library)
+
+    def after(self, record: SceneRecord, states: Sequence[SceneState] = ()) -> Push:
+        """Make the push after a change: it outlives the execution of its own actions, and nothing else.
+
+        Args:
+            record: the scene after the change; the simulation counts actions as revisions.
+            states: the way there.
+        """
+        last = self.record.revision + len(self.actions)
+        if record.revision <= self.record.revision or (self.state == "executed" and record.revision == last):
+            return self
+        if self.state == "executing" and record.revision <= last:
+            truth = (*(self.truth or (self.record.state,)), *states, record.state)
+            return replace(self, truth=truth, state="executed" if record.revision == last else "executing")
+        return self.without_prediction("outdated", _CHANGED)
+
+    def without_prediction(self, state: PushState, problem: str) -> Push:
+        """Make the push of which nothing is to be drawn, for a reason."""
+        return Push(self.record, self.actions, state, problem)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PushChanged:
+    """This push is tried now; None if none is."""
+
+    push: Push | None
+
+
+class Pushes:
+    """The push that is tried on the current table. Any thread may call.
+
+    Args:
+        scenes: executes actions.
+        predictions: predicts pushes.
+        hub: tells of changes of the table, and is told of those of the push.
+    """
+
+    def __init__(self, scenes: Scenes, predictions: Predictions, hub: Hub) -> None:
+        self._scenes, self._predictions, self._hub = scenes, predictions, hub
+        self._lock = threading.RLock()  # whoever holds it must not call `scenes`, which publishes under its own
+        self._push: Push | None = None
+        hub.subscribe(self._hear)
+
+    @property
+    def current(self) -> Push | None:
+        """The push that is tried; None if none is."""
+        return self._push
+
+    @property
+    def is_warm(self) -> bool:
+        """Whether the network is loaded; the first prediction waits for it."""
+        return self._predictions.is_warm
+
+    def predict(self, target: Float[np.ndarray, "2"] | None = None, speed_m_s: float = SPEED_M_S) -> Push:
+        """Choose a push from where the pusher is, and ask what it would do; the answer is published.
+
+        Args:
+            target: where the pusher is to go [m]; None for just beyond the nearest object.
+            speed_m_s: not to be exceeded.
+
+        Raises:
+            InvalidInput: if the way is empty or takes too many actions.
+            NothingToPush: if there is no scene, no pusher or no object.
+            MissingFields: if objects have no field.
+            CannotExecute: if one is being executed.
+        """
+        record = self._predictions.current()
+        target = beyond_nearest(record.state) if target is None else target
+        if record.state.pusher is None or target is None:
+            raise NothingToPush("There is nothing to push on this table; put an object on it.")
+        push = Push(record, toward(record.state.pusher[:2], target, speed_m_s))
+        with self._lock:
+            if self._push is not None and self._push.state == "executing":
+                raise CannotExecute("A push is being carried out; wait for its end.")
+            self._set(push)
+        try:
+            answer = self._predictions.submit(record.state, push.actions[None], _KEY)
+        except OsfError:
+            self._replace(push, None)
+            raise
+        answer.add_done_callback(partial(self._take, push))
+        return push
+
+    def execute(self) -> Push | None:
+        """Carry out the push that was predicted; returns it with what came of it, if nothing else has happened since.
+
+        Raises:
+            CannotExecute: if none is predicted that is still to be tried.
+            SceneHeld: if a job holds the scene.
+        """
+        with self._lock:
+            push = self._push
+            if push is None or push.state != "predicted":
+                raise CannotExecute("There is no new prediction to execute; drag the pusher first.")
+            self._set(replace(push, state="executing"))
+        try:
+            self._scenes.act(push.record.id, list(push.actions))
+        finally:
+            with self._lock:
+                now = self._push
+                if now is not None and now.state == "executing":  # refused, or ended halfway
+                    self._set(now.without_prediction("outdated", _CHANGED) if now.truth else push)
+        return self._push
+
+    def drop(self) -> None:
+        """Forget the push; what is being executed goes on."""
+        with self._lock:
+            if self._push is not None:
+                self._set(None)
+
+    def _take(self, push: Push, answer: Future[NeuralAnswer]) -> None:
+        """Take the answer to a push, unless another was chosen or the table has changed meanwhile."""
+        try:
+            predicted = answer.result()
+        except OsfError as error:
+            self._replace(push, push.without_prediction("refused", str(error)))
+        except Exception:
+            _log.exception("a push could not be predicted")
+            self._replace(push, push.without_prediction("refused", "The prediction failed; the log has more."))
+        else:
+            if isinstance(predicted, Predicted):  # else overtaken by a newer request
+                known = replace(push, state="predicted", rollouts=predicted.rollouts, took_s=predicted.took_s)
+                self._replace(push, known)
+
+    def _hear(self, event: object) -> None:
+        with self._lock:
+            push = self._push
+            match event:
+                case CurrentScene() if push is not None:
+                    self._set(None)
+                case SceneChanged(record, states) if push is not None and record.id == push.record.id:
+                    if push.state not in ("refused", "outdated"):
+                        self._replace(push, push.after(record, states))
+
+    def _replace(self, before: Push, after: Push | None) -> None:
+        with self._lock:
+            if self._push is before and after is not before:
+                self._set(after)
+
+    def _set(self, push: Push | None) -> None:
+        self._push = push
+        self._hub.publish(PushChanged(push))

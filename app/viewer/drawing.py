@@ -14,9 +14,8 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from html import escape
 
-from app.processes.messages.scene_messages import FramesTaken, SceneChanged, SceneRecord
+from app.processes.messages.scene_messages import SceneChanged, SceneRecord
 from app.services.event_hub import CurrentScene
 from app.viewer.nodes.scene_nodes import Client, SceneNodes
 from osfcore.geometry.states import SceneState
@@ -99,7 +98,7 @@ class DrawingThread:
 
 
 class Panel(ABC):
-    """A folder of controls and the nodes it draws: stores events as they come, and draws the newest state in a thread.
+    """What draws some nodes: stores events as they come, and draws the newest state in a thread.
 
     Args:
         name: of the thread, for logs.
@@ -142,18 +141,10 @@ class Panel(ABC):
         """Draw the newest state. Called in the thread."""
 
 
-_STATUS_STYLE = "margin:0;padding:0.2em 0.75em 0.5em;font-size:0.8em;line-height:1.35"
-
-
-def status(about: str, text: str) -> str:
-    """Write the HTML of a sentence about something, a word; the text may hold names that users choose."""
-    return f'<p class="{about}-status" style="{_STATUS_STYLE}">{escape(text)}</p>'
-
-
 # The playback
 
 _CATCH_UP_S = 0.5  # further behind than this, playing goes faster than time
-_Change = CurrentScene | SceneChanged | FramesTaken
+_Change = CurrentScene | SceneChanged
 
 
 class Playback:
@@ -198,8 +189,6 @@ class Playback:
                 case SceneChanged(record, states, interval_s) if record.id == self._noted:
                     self._generation += not states
                     self._waiting_s += interval_s * len(states)
-                case FramesTaken(scene) if scene == self._noted:
-                    pass
                 case _:
                     return
             self._queue.put((event, self._generation))
@@ -225,9 +214,6 @@ class Playback:
                         self._waiting_s -= interval_s * len(states)
                 if generation == self._generation and record.id == self._shown:
                     self._drawing.place(record.state)
-            case FramesTaken(_, _, names, images):
-                if generation == self._generation:
-                    self._drawing.show_frames(names, images)
 
     def _play_states(self, states: tuple[SceneState, ...], interval_s: float, generation: int) -> None:
         due = time.monotonic()

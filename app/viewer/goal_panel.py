@@ -17,10 +17,9 @@ from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged, Goals
 from app.viewer.drawing import Panel, RunCommand
 from app.viewer.nodes.episode_nodes import GOAL, add_copy
-from app.viewer.nodes.ghosts import UNKNOWN_M
+from app.viewer.nodes.ghosts import size_m
 from app.viewer.nodes.room import NO_TURN, Colour, atomic, put, send_again
 from app.viewer.nodes.scene_nodes import Client, level_point
-from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose, quaternion_multiply
 from osfcore.objects.asset_library import AssetLibrary
 
@@ -134,7 +133,7 @@ class _Copy:
         # The shape hangs on the ring, so that it turns at once in the browser of whoever turns it.
         self._ring = scene.add_transform_controls(
             path,
-            scale=(_reach_m(library, name) + _RING_BESIDE_M) / _RING,
+            scale=(float(np.linalg.norm(size_m(library, name))) / 2 + _RING_BESIDE_M) / _RING,
             active_axes=(True, True, False),
             disable_axes=True,
             disable_sliders=True,
@@ -193,14 +192,6 @@ class _Copy:
         if not np.all(np.isfinite([x, y])):
             return self._laid
         return Pose(np.array([x, y, self._laid.position[2]]), turn)
-
-
-def _reach_m(library: AssetLibrary, name: str) -> float:
-    """How far an object reaches from its centre, however it lies; a guess for one that was removed [m]."""
-    try:
-        return float(np.linalg.norm(library.size_m(name))) / 2
-    except OsfError:
-        return UNKNOWN_M
 
 
 def _about_z(turn: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:

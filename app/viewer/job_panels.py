@@ -1,4 +1,4 @@
-"""Estimates and episodes in the 3D view: their folders in the panel, and the threads that draw their newest events.
+"""Estimates and episodes in the 3D view: the threads that draw their newest events.
 
 Events come from the jobs' thread and are only stored there; drawing, at most some times a second, happens here.
 """
@@ -8,9 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-
-import viser
 
 from app.jobs.job import Job, JobChanged, JobView
 from app.jobs.kinds.estimates import EstimateParams
@@ -19,9 +16,8 @@ from app.services import episodes, estimates
 from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged
 from app.viewer.drawing import Panel
-from app.viewer.nodes.episode_nodes import EpisodeNodes, Part
+from app.viewer.nodes.episode_nodes import EpisodeNodes
 from app.viewer.nodes.estimate_nodes import EstimateNodes
-from app.viewer.nodes.scene_nodes import SceneNodes
 from osfcore.control.events import GoalFound, Looking, Stepped
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.states import EstimatedState
@@ -29,11 +25,6 @@ from osfcore.planning.costs import PoseGoal
 from osfcore.planning.mppi import PlanSketch
 
 ESTIMATE_INTERVAL_S, EPISODE_INTERVAL_S = 0.1, 0.08  # least time between two drawings
-_PARTS: tuple[tuple[Part, str, str], ...] = (
-    ("goal", "Show goal", "Golden: where everything should be."),
-    ("plan", "Show plan", "Ways of the pusher, cheap ones green; purple: the best one, and where it leads."),
-    ("estimate", "Show estimate", "Where the cameras have found objects and light; what is doubted is orange."),
-)
 
 
 def takes_view(job: Job, shown: Job | None) -> bool:
@@ -43,52 +34,15 @@ def takes_view(job: Job, shown: Job | None) -> bool:
     return shown is None or shown.id == job.id or shown.is_finished or job.state == "running"
 
 
-class _TrueLight:
-    """The box that asks for the simulation's own light, while an estimated one stands in its place.
-
-    Args:
-        gui: whose open folder gets the box.
-        table: draws the light.
-        by: who asks.
-        is_estimated: whether an estimated light is on view.
-    """
-
-    def __init__(self, gui: viser.GuiApi, table: SceneNodes, by: str, is_estimated: Callable[[], bool]) -> None:
-        self._table, self._by, self._is_estimated = table, by, is_estimated
-        self._is_wanted = gui.add_checkbox(
-            "Show true light", False, hint="The simulation's own light, which the estimator does not know."
-        )
-        self._is_wanted.on_update(lambda _: self.draw())
-
-    def draw(self) -> None:
-        """Show the lamp as usual; while an estimated light is on view only on demand, in another colour."""
-        if self._is_estimated():
-            self._table.show_lamp(is_on=self._is_wanted.value, name="true light", by=self._by)
-        else:
-            self._table.show_lamp(is_on=True, by=self._by)
-
-
 class EstimatePanel(Panel):
-    """The nodes of estimates, and a folder to choose which are drawn; the same in all browsers.
+    """The nodes of estimates; the same in all browsers."""
 
-    Args:
-        server: whose panel gets the folder.
-        table: whose own light is the true one.
-        nodes: of estimates.
-    """
-
-    def __init__(self, server: viser.ViserServer, table: SceneNodes, nodes: EstimateNodes) -> None:
+    def __init__(self, nodes: EstimateNodes) -> None:
         super().__init__("estimate-panel", ESTIMATE_INTERVAL_S)
         self._nodes = nodes
         self._job: Job | None = None
         self._step: EstimateStep | None = None  # not drawn yet
         self._drawn_job: str | None = None
-        gui = server.gui
-        with gui.add_folder("Estimate", expand_by_default=False):
-            wants_tried = gui.add_checkbox("Show candidates", True, hint="Poses and lights that are tried.")
-            self._true_light = _TrueLight(gui, table, estimates.KIND, lambda: not nodes.is_empty)
-            gui.add_button("Clear", hint="Remove what an estimate has drawn.").on_click(lambda _: self.forget())
-        wants_tried.on_update(lambda event: nodes.show_candidates(event.target.value))
 
     def forget(self) -> None:
         """Remove what a finished estimate has drawn. Any thread may call."""
@@ -104,6 +58,9 @@ class EstimatePanel(Panel):
                 self._job = job
             case CurrentScene():
                 if self._job is not None and not self._is_here(self._job):
+                    self._job, self._step = None, None
+            case SceneChanged(record) if record.id == self._current and self._job is not None:
+                if self._job.is_finished:  # what it found has moved
                     self._job, self._step = None, None
             case _:
                 return False
@@ -121,7 +78,6 @@ class EstimatePanel(Panel):
             self._drawn_job = None if job is None else job.id
         if step is not None:
             self._nodes.show(step.state, step.candidates, step.lights, step.estimate)
-        self._true_light.draw()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -175,40 +131,20 @@ class _EpisodeState:
 
 
 class EpisodePanel(Panel):
-    """The nodes of episodes, and a folder to choose which are drawn; the same in all browsers.
+    """The nodes of episodes; the same in all browsers.
 
     Args:
-        server: whose panel gets the folder.
-        table: whose own light is the true one.
         nodes: of episodes.
         make_room: called before an episode is drawn, to remove what would be in its way.
     """
 
-    def __init__(
-        self, server: viser.ViserServer, table: SceneNodes, nodes: EpisodeNodes, make_room: Callable[[], object]
-    ) -> None:
+    def __init__(self, nodes: EpisodeNodes, make_room: Callable[[], object]) -> None:
         super().__init__("episode-panel", EPISODE_INTERVAL_S)
         self._nodes = nodes
         self._make_room = make_room
         self._state = _EpisodeState()
         self._drawn = _EpisodeState()
         self._plan_at = 0.0
-        gui = server.gui
-        with gui.add_folder("Episode", expand_by_default=False):
-            for part, label, hint in _PARTS:
-                gui.add_checkbox(label, True, hint=hint).on_update(partial(self._show_part, part))
-            self._true_light = _TrueLight(gui, table, episodes.KIND, lambda: nodes.shows_light)
-            clear = gui.add_button("Clear", hint="Remove what a finished episode has drawn.")
-            clear.on_click(lambda _: self._forget())
-
-    def _show_part(self, part: Part, event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
-        self._nodes.show_part(part, event.target.value)
-        self._true_light.draw()
-
-    def _forget(self) -> None:
-        with self._thread.changing():
-            if not self._state.is_live:
-                self._state = _EpisodeState()
 
     def _store(self, event: object) -> bool:
         state = self._state
@@ -261,7 +197,6 @@ class EpisodePanel(Panel):
         if state.plan is not drawn.plan:
             self._nodes.show_plan(state.plan)
             self._plan_at = time.monotonic()
-        self._true_light.draw()
         self._drawn = state
 
 

@@ -27,7 +27,7 @@ from app.viewer.neural_panel import NeuralPanel
 from app.viewer.nodes.episode_nodes import EpisodeNodes, add_copy
 from app.viewer.nodes.estimate_nodes import TRACKED
 from app.viewer.nodes.room import VIEW_FOV_RAD, atomic, framing
-from app.viewer.nodes.scene_nodes import LAMP, LIVE_NODES, SceneNodes, extent_m
+from app.viewer.nodes.scene_nodes import LAMP, LIVE_NODES, SceneNodes, extent_m, pointed_at
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
@@ -36,8 +36,10 @@ from osfcore.objects.asset_library import AssetLibrary
 DRAW_INTERVAL_S = 0.04
 _ROOT, _CHOSEN = "/replay", "/chosen"
 # What one may choose not to see, below the root of what is on view.
-_TRACKED, _TRUTH = f"/episode/estimate/{TRACKED}", ("/objects", "/shadows", "/names")
+_TRACKED, _HANDLES = f"/episode/estimate/{TRACKED}", "/handles"
+_TRUTH = "/objects", "/shadows", "/light", "/light_ray", _HANDLES
 Shows = Literal["meshes", "fields", "beliefs"]
+_POINTED_ROWS = 500
 _MOST_PAGES = 200  # that are remembered; those that asked longest ago are forgotten
 _log = logging.getLogger(__name__)
 
@@ -67,11 +69,13 @@ class Wish:
         replay: an episode; None for the live table.
         shows: things as meshes, as their fields render them, or only what is believed of them.
         goal: whose objects are drawn in gold on the live table, if their places are known.
+        handles: whether objects have handles to lift and turn them.
     """
 
     replay: Replay | None = None
     shows: Shows = "meshes"
     goal: GoalRecord | None = None
+    handles: bool = False
 
 
 class _View:
@@ -212,6 +216,23 @@ class PageViews(Panel):
                 known.framed = self._live() if view.nodes is None else view.nodes.table.state()
             known.is_due = True
 
+    def pointed_at(self, page: str, across: float, down: float) -> str | None:
+        """Return what stands at a place in a page's view, as `pointed_at` names it. Any thread may call.
+
+        Args:
+            page: what it calls itself.
+            across: share of the view's width, from the left.
+            down: share of its height, from the top.
+        """
+        with self._thread.changed:
+            view = self._page(page).view
+        camera = None if view is None else view.picture.camera(_POINTED_ROWS)
+        if view is None or camera is None:
+            return None
+        pixel = np.array([across * camera.width, down * camera.height])
+        eye, way = camera.T_world_camera.position, camera.ray_directions(pixel)
+        return pointed_at(view.picture.seen()[0], self._library, eye, way)
+
     def add_client(self, client: viser.ClientHandle) -> None:
         """Show what a page has asked for in the browser that has opened its view, perhaps once more."""
         page = self._page_of(client.client_id)
@@ -288,7 +309,9 @@ class PageViews(Panel):
                 with self._thread.changed:
                     page.is_due = True
                     self._thread.wake(DRAW_INTERVAL_S)
-        hidden = _TRUTH if wish.shows == "beliefs" else (_TRACKED,)
+        hidden = {*_TRUTH} if wish.shows == "beliefs" else {_TRACKED}
+        if not wish.handles:
+            hidden.add(_HANDLES)
         view.picture.hidden.hide("page", {f"{root}{path}" for path in hidden})
         if framed is not None and framed.names:
             view.frame(extent_m(framed, self._library, goal.poses or () if goal else ()))
@@ -318,8 +341,7 @@ class ReplayNodes:
         self._root = client.scene.add_frame(_ROOT, show_axes=False)
         client.scene.add_frame(f"{_ROOT}/objects", show_axes=False)  # what is hidden as a whole needs a node of its own
         self.table = SceneNodes(client, library, root=_ROOT)
-        self.table.show_names(is_on=False)
-        self._episode = EpisodeNodes(client, library, self.table.names, root=f"{_ROOT}/episode")
+        self._episode = EpisodeNodes(client, library, root=f"{_ROOT}/episode")
         client.scene.add_frame(f"{_ROOT}{_TRACKED}", show_axes=False)
         self.table.show(trajectory.states[0])
         self.follow(trajectory)

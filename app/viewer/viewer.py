@@ -22,7 +22,7 @@ from app.processes.messages.scene_messages import SceneRecord
 from app.services.driver import DriverChanged
 from app.services.event_hub import CurrentScene
 from app.services.goals import DraftChanged, Goals
-from app.services.pushes import Predictions
+from app.services.pushes import Pushes
 from app.services.runner import Runner
 from app.storage.paths import without_places
 from app.storage.records import Poses
@@ -37,7 +37,6 @@ from app.viewer.page_views import PageViews
 from app.viewer.private_server import PrivateViser
 from app.viewer.push_panel import PushPanel
 from osfcore.errors import OsfError
-from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 
@@ -49,12 +48,7 @@ class Viewer:
     """The view of the runner's current scene, the same for any number of browsers."""
 
     def __init__(
-        self,
-        runner: Runner,
-        neural: ProcessClient,
-        fields: Callable[[], Collection[str]],
-        predictions: Predictions,
-        goals: Goals,
+        self, runner: Runner, neural: ProcessClient, fields: Callable[[], Collection[str]], pushes: Pushes, goals: Goals
     ) -> None:
         """Prepare the view.
 
@@ -62,11 +56,11 @@ class Viewer:
             runner: executes commands on scenes.
             neural: renders fields.
             fields: names of the objects that have a field.
-            predictions: predicts pushes.
+            pushes: the push that is tried.
             goals: goal images, and the draft of one.
         """
         self._goals = goals
-        self._predictions = predictions
+        self._pushes = pushes
         self._runner = runner
         self._neural = neural
         self._fields = fields
@@ -96,15 +90,12 @@ class Viewer:
         """Open the loopback server and draw what there is."""
         self._server = PrivateViser()
         add_room(self._server)
-        self._drawing = SceneNodes(
-            self._server, self._runner.library, self._move_object, self._move_light, cameras=default_cameras()
-        )
+        self._drawing = SceneNodes(self._server, self._runner.library, self._move_object, self._move_light)
         self._playback = Playback(self._drawing)
         self.pages = PageViews(
             self._runner.library, self._server.page_of, self._drawing.state, self._neural, self._fields
         )
         self._drawing.watch(self.pages.neural.moved)
-        self._add_controls(self._server)
         self._panels = self._make_panels(self._server)
         self._server.on_client_connect(self._add_client)
         self._server.on_client_disconnect(self._remove_client)
@@ -114,6 +105,7 @@ class Viewer:
         listeners = (self._playback.note, *(panel.show for panel in self._panels), self._on_event)
         self._undo = [self._runner.hub.subscribe(listener) for listener in listeners]
         self._show_current()
+        self._update_gizmos()
         gc.freeze()  # what is there by now stays: looking for what browsers leave is twenty times as fast without it
         self._memory.start()
 
@@ -139,22 +131,18 @@ class Viewer:
         self._goal_panel.put_handles_back()
 
     def _make_panels(self, server: PrivateViser) -> tuple[Panel, ...]:
-        """Make the panels, in the order of their folders."""
-        library, table = self._runner.library, self._drawing
-        estimate = EstimatePanel(server, table, EstimateNodes(server, library, table.names))
+        """Make what draws jobs, goals and pushes."""
+        library = self._runner.library
+        estimate = EstimatePanel(EstimateNodes(server, library))
         self._goal_panel = GoalPanel(server, library, self._goals, self._commands, self._run_command)
-        episode = EpisodePanel(server, table, EpisodeNodes(server, library, table.names), estimate.forget)
-        push = PushPanel(
-            server, library, table.pusher, self._predictions, self._commands, self._runner.scenes.act, self._run_command
-        )
+        episode = EpisodePanel(EpisodeNodes(server, library), estimate.forget)
+        push = PushPanel(server, library, self._drawing.pusher, self._pushes, self._commands, self._run_command)
         return self.pages.neural, self.pages, estimate, self._goal_panel, episode, push
 
     def _add_client(self, client: viser.ClientHandle) -> None:
-        self._runner.scenes.watch_frames(1)
         self.pages.add_client(client)
 
     def _remove_client(self, client: viser.ClientHandle) -> None:
-        self._runner.scenes.watch_frames(-1)
         self.pages.remove_client(client)
         self._memory.wake(_AFTER_LEAVING_S)
 
@@ -164,19 +152,6 @@ class Viewer:
     def _current_record(self) -> SceneRecord | None:
         current = self._runner.scenes.current
         return None if current is None else self._runner.scenes.get(current)
-
-    def _add_controls(self, server: PrivateViser) -> None:
-        gui = server.gui
-        gui.configure_theme(show_share_button=False, show_logo=False, control_width="small")
-        gui.set_panel_label("Scene")
-        self._wants_gizmos = gui.add_checkbox("Handles", False, hint="Show handles to lift and turn the objects.")
-        cameras = gui.add_checkbox("Cameras", False)
-        names = gui.add_checkbox("Names", True)
-        gui.main_panel.minimize()
-
-        self._wants_gizmos.on_update(lambda _: self._update_gizmos())
-        cameras.on_update(lambda event: self._drawing.show_cameras(event.target.value))
-        names.on_update(lambda event: self._drawing.show_names(event.target.value))
 
     def _move_object(self, name: str, pose: Pose, client: Client) -> None:
         """An object was let go. Called on viser's loop."""
@@ -224,12 +199,12 @@ class Viewer:
             self._goal_panel.put_handles_back()
 
     def _update_gizmos(self) -> None:
-        """Objects can be dragged while no job holds the scene and no goal is being composed."""
+        """Let objects be dragged while no job holds the scene and no goal is being composed."""
         current = self._runner.scenes.current
         is_free = current is not None and self._runner.jobs.holder(current) is None
         is_free = is_free and not self._goal_panel.is_composing
         self._drawing.let_grab(is_free)
-        self._drawing.show_gizmos(self._wants_gizmos.value and is_free)
+        self._drawing.show_gizmos(is_free)
 
 
 def release_memory() -> None:

@@ -1,7 +1,5 @@
 """Whether a photo shows some objects at all: a quick check before a goal image is estimated, and before any episode.
 
-Quicker still, `is_goal_view` tells pictures of the goal camera from photographs of other tables.
-
 Two independent cues, neither of which needs exact poses. Colour indexing (Swain and Ballard, 1991) compares the
 chromaticities of what is no table with those of the objects' fields: matte shading under a white light does not change
 them. Template matching puts the objects where they explain the photo best, and measures how much worse the best one's
@@ -19,8 +17,7 @@ from jaxtyping import Bool, Float32
 from osfcore.estimation.hypotheses import SceneAssembly, match_templates, table_errors, without_objects
 from osfcore.estimation.objective import FINE_SIDE, QUALITY, ObjectModels, full_circle, loss_of, views_of
 from osfcore.estimation.steps import ContentCheck, Verdict
-from osfcore.fields.table import TableField
-from osfcore.geometry.cameras import Camera, goal_camera
+from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import quaternion_multiply
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.render.types import SceneBatch
@@ -39,10 +36,6 @@ _PRESENT = 1 / 8  # of a palette's strongest bin, from which a colour counts as 
 # photos of right objects were "shown", one "doubtful"; of 120 of wrong ones 88 were "others", 27 "doubtful", 5 "shown".
 _EVIDENCE = (8.0, 4.0, -5.0)
 _SHOWN, _OTHERS = 0.0, -1.5  # log odds
-# Of the border of 24 goal images with one to eight objects, and of these as JPEGs, turned, dimmed, cropped or noisy, at
-# most 33 % lay beside the table's colour; of four real photographs of tables, 59 % or more.
-_BORDER, _MOST_BESIDE = 1 / 12, 0.5  # of the picture's side; of the border
-_BESIDE_TABLE = 0.03  # error of a pixel that the table does not explain [radiance]
 
 
 class ContentChecker:
@@ -124,24 +117,6 @@ class ContentChecker:
         loss = loss_of(self._models, coarse, params)
         without = [loss_of(self._models, coarse, without_objects(params, [n])) for n in range(len(observation.names))]
         return float(np.log(max(without) / loss))
-
-
-def is_goal_view(table: TableField, image: Float32[np.ndarray, "h w 3"], camera: Camera) -> bool:
-    """Whether a picture's border, where objects seldom lie, is the table as a camera sees it; also if it is plain.
-
-    Args:
-        table: what the objects lie on.
-        image: linear radiance.
-        camera: that may have taken it.
-    """
-    views = views_of(Observation((camera,), image[None], (), None, None, 0.0), FINE_SIDE)
-    if views.images[0].std(axis=(0, 1)).max() < _PLAIN:
-        return True
-    beside = np.sqrt(table_errors(ObjectModels({}, table), views)) > _BESIDE_TABLE
-    border = np.ones_like(beside)
-    width = round(_BORDER * min(beside.shape))
-    border[width:-width, width:-width] = False
-    return bool(beside[border].mean() < _MOST_BESIDE)
 
 
 def _chromaticities(pixels: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "b b"]:

@@ -79,7 +79,7 @@ def download(address: str, path: Path, max_bytes: int = MAX_BYTES) -> bool:
             if error.code < 500:
                 break
         except (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError) as error:
-            reason = f"no connection ({getattr(error, 'reason', None) or error})"
+            reason = f"no connection, check the network ({getattr(error, 'reason', None) or error})"
     raise FetchFailed(address, reason)
 
 

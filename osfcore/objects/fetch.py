@@ -25,6 +25,7 @@ from osfcore.progress import Progress
 # A source brings files onto this machine; `fetch` turns them into objects. Everything downloaded lands under a
 # temporary name in the cache folder and is renamed once it is complete and verified.
 
+YCB_DOWNLOAD = "https://ycb-benchmarks.s3.amazonaws.com/data/google"  # the official archives, of all objects
 _LAYOUTS = ("{name}/google_16k/textured.obj", "{name}/textured.obj")
 
 
@@ -137,7 +138,7 @@ class FolderSource(Source):
     def __init__(self, folder: Path) -> None:
         self._folder = Path(folder).expanduser()
         if not self._folder.is_dir():
-            raise InvalidInput("source", folder, "'pypi', a folder that exists or an http(s) address")
+            raise InvalidInput("source", folder, "'pypi', 'ycb', a folder that exists or an http(s) address")
         self.label = str(self._folder.resolve())
 
     def names(self) -> tuple[str, ...]:
@@ -235,13 +236,15 @@ def _named(path: Path, key: str) -> tuple[str, ...]:
 
 
 def source_from(text: str, cache: Path) -> Source:
-    """Return the source that a user names: "pypi", an http(s) address or a folder.
+    """Return the source that a user names: "pypi", "ycb" for the official download, an http(s) address or a folder.
 
     Raises:
         InvalidInput: if it is none of these.
     """
     if text == "pypi":
         return WheelSource(cache)
+    if text == "ycb":
+        return UrlSource(YCB_DOWNLOAD, cache)
     if "://" in text:
         return UrlSource(text, cache)
     return FolderSource(Path(text))

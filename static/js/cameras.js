@@ -72,10 +72,17 @@ function refresh(scene) {
 
 const large = new LatestImage(byId("camera-large"));
 
+/** Shows the large view as what is on view now, live or recorded, would have it. */
+function drawLarge() {
+  const isRecorded = Boolean(known("recorded"));
+  byId("camera-large").hidden = isRecorded;
+  for (const [i, part] of [...byId("camera-dialog").querySelectorAll(".crop")].entries()) part.hidden = !isRecorded || NAMES[i] !== largeCamera;
+}
+
 function enlarge(name) {
   const scene = current();
-  if (!scene) return;
-  if (isComparing()) {
+  if (!scene && !known("recorded")) return;
+  if (isComparing() && !known("recorded")) {
     enlargeComparison(name);
     return;
   }
@@ -83,6 +90,7 @@ function enlarge(name) {
   byId("camera-dialog-title").textContent = labelOfTile(name);
   byId("camera-large").alt = byId("camera-dialog-title").textContent;
   large.clear();
+  drawLarge();
   refresh(scene);
   byId("camera-dialog").showModal();
 }
@@ -123,7 +131,7 @@ export function setUpCameras() {
   watch("recorded", (on) => {
     byId("cameras").classList.toggle("is-recorded", on);
     byId("cameras-title").textContent = on ? "Cameras, recorded" : "Cameras";
-    for (const tile of byId("camera-strip").children) tile.disabled = on; // what they see now is not on view
+    drawLarge();
     refresh(current());
   });
   let shown = null;

@@ -20,7 +20,7 @@ function entry({ path, kind, id, reason }) {
 export async function refreshDamaged() {
   const lists = await tellFailure(() => Promise.all(Object.entries(KINDS).map(async ([path, kind]) => {
     const { damaged, objects = [] } = await get(path === "objects" ? path : `${path}?limit=1`);
-    const again = objects.filter((object) => object.fetchable).map((object) => object.name); // offered in the catalogue
+    const again = objects.filter((object) => !object.own).map((object) => object.name); // offered in the catalogue
     return damaged.filter(({ id }) => !again.includes(id)).map((one) => ({ path, kind, ...one }));
   })));
   if (!lists) return;

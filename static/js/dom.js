@@ -11,6 +11,12 @@ export function el(tag, { attributes = {}, on = {}, ...properties } = {}, ...chi
   return node;
 }
 
+/** Shows on a bar how much of a file has been sent; once all has, it only says that it goes on. */
+export const shareOn = (bar) => (share) => {
+  bar.value = share;
+  if (share === 1) bar.removeAttribute("value");
+};
+
 /** Runs an async action with its button disabled meanwhile. */
 export async function whileDisabled(button, action) {
   if (button.disabled) return;

@@ -94,7 +94,7 @@ function sourceOf({ id, name, status, steps, step_s: times }) {
     times: times.length < steps.length ? steps.map((_, i) => STEP_S * i) : times,
     actions: steps.map(({ step }) => step),
     draw: drawStep,
-    left: closeShown,
+    left: hideShown,
   };
 }
 
@@ -182,18 +182,27 @@ function follow(job) {
   if (wanted) fetchWanted();
 }
 
-/** Takes the episode on view off it; one that runs comes back on view. */
-export function closeShown() {
-  if (!shown) return;
+function hideShown() {
   shown = null;
   wanted = null;
   closings += 1;
   note({ episode: null, step: null, beside: null });
   drawBeside(null, 0);
   byId("shown").hidden = true;
+}
+
+/** Takes the episode on view off it; one that runs comes back on view. */
+export function closeShown() {
+  if (!shown) return;
+  hideShown();
   timeline.close();
+  showRunning();
+}
+
+/** Puts an episode that runs on view, unless one is. */
+export function showRunning() {
   const job = known("episode");
-  if (LIVE.has(job?.state)) openEpisode(job.id);
+  if (!shown && LIVE.has(job?.state)) openEpisode(job.id);
 }
 
 /** Takes an episode off view that was removed for good. */

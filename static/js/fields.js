@@ -174,7 +174,7 @@ function drawTraining(job) {
   byId("training-bar").hidden = !LIVE.has(job.state);
   byId("training-bar").value = job.total ? job.done / job.total : 0;
   // PSNR stands in the head already.
-  byId("training-state").textContent = job.state === "done" ? "done, measured on all unseen images" : stateText(job).replace(/^.*dB.*, (?=.* left$)/, "");
+  byId("training-state").textContent = job.state === "done" ? "done; measured on all unseen images, before only on a few" : stateText(job).replace(/^.*dB.*, (?=.* left$)/, "");
   byId("training-error").textContent = inWords(job.error ?? "");
   byId("training-error").hidden = !job.error;
   const preview = result.previews && job.state !== "failed" && job.state !== "cancelled"

@@ -33,6 +33,7 @@ import { refreshObjects, setUpObjects } from "./objects.js";
 import { setUpOwnObject } from "./own-object.js";
 import { refreshPhotos, setUpPhoto } from "./photo.js";
 import { setUpPicture } from "./picture.js";
+import { setUpPredictedPush } from "./predicted-push.js";
 import { setUpPresets } from "./presets.js";
 import { setUpPush } from "./push.js";
 import { setUpResults } from "./results.js";
@@ -92,6 +93,7 @@ setUpNeural();
 setUpLooks();
 setUpFool();
 setUpPush();
+setUpPredictedPush();
 setUpLight();
 setUpNumbers();
 setUpScenes();
@@ -137,6 +139,7 @@ listen(VISITOR, {
     if (again) {
       expectOlder();
       set("draft", null); // told again if there still is one
+      set("push", null);
       refreshScenes();
       refreshObjects();
       refreshSets();
@@ -164,6 +167,7 @@ listen(VISITOR, {
     dropEpisode(job);
   },
   draft: (draft) => set("draft", draft),
+  push: (push) => set("push", push),
   goals: () => refreshGoals(),
   photos: () => refreshPhotos(),
   driver: (driver) => set("driver", driver),

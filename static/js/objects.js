@@ -54,7 +54,7 @@ function fetchButton({ name, label }) {
 
 function actions(object) {
   const { label } = object;
-  if (!object.available) return object.fetchable ? [fetchButton(object)] : [];
+  if (!object.available) return object.own ? [] : [fetchButton(object)];
   const buttons = [button("Put on the table", label, () => putOnTable(object.name))];
   if (!(known("fields") ?? []).some((field) => field.name === object.name)) {
     buttons.push(button("Train its field", label, () => prepareTraining(object.name)));
@@ -79,7 +79,9 @@ export async function refreshObjects() {
   if (answer) set("objects", answer.objects);
 }
 
-/** Fetches some objects, all for none, and shows how that goes; `pressed` is what was pressed for it. */
+const missing = () => objects().filter((object) => !object.available && !object.own).map((object) => object.name);
+
+/** Fetches some objects, the ten of the package index for none, and shows how that goes; `pressed` is what was pressed for it. */
 export function fetchObjects(pressed, names = []) {
   return act(pressed, async () => {
     showJob(await post("jobs", { kind: "fetch_assets", params: { names } }));
@@ -95,18 +97,14 @@ function draw() {
   if (now === drawn) return;
   drawn = now;
   const there = objects().filter((object) => object.available).length;
-  const missing = objects().some((object) => object.fetchable && !object.available);
-  const elsewhere = objects().filter((object) => !object.available && !object.fetchable);
-  byId("object-list").replaceChildren(...objects().filter((object) => !elsewhere.includes(object)).map(entry));
+  byId("object-list").replaceChildren(...objects().map(entry));
   byId("objects-hint").textContent = objects().length ? `${there} of ${objects().length} are on this machine.` : "";
-  byId("objects-elsewhere").hidden = !elsewhere.length;
-  byId("objects-elsewhere-list").textContent = elsewhere.map(({ label }) => label).join(", ");
-  byId("fetch-objects").hidden = !missing;
+  byId("fetch-objects").hidden = !missing().length;
 }
 
 export function setUpObjects() {
   const all = byId("fetch-objects");
-  all.addEventListener("click", () => fetchObjects(all));
+  all.addEventListener("click", () => fetchObjects(all, missing()));
   byId("add-own").addEventListener("click", () => scrollTo(byId("new-object").closest(".card")));
   watch("objects", draw);
   watch("fields", draw);

@@ -16,7 +16,7 @@ const stage = () => byId("photo-stage");
 const polygon = (points) => `M${points.map(([x, y]) => `${x} ${y}`).join("L")}Z`;
 const tenth = (value) => Math.round(10 * value) / 10;
 const clamp = ([x, y]) => [tenth(Math.min(Math.max(x, 0), photo.width)), tenth(Math.min(Math.max(y, 0), photo.height))];
-const unit = () => Math.max(photo.width, photo.height) / 1000; // about a pixel of the page
+const unit = () => 1 / (byId("photo-svg").getScreenCTM()?.a ?? 1); // a pixel of the page
 
 /** Where a pointer is in the photo. */
 function at(event) {
@@ -36,7 +36,7 @@ function rect([left, top, right, bottom]) {
 function marksOf(object) {
   const isChosen = object.name === chosen;
   const [left, top] = object.box;
-  const name = svg("text", { x: left + 4 * unit(), y: Math.max(top - 6 * unit(), 16 * unit()), class: "photo-name", "font-size": 16 * unit() });
+  const name = svg("text", { x: left + 4 * unit(), y: Math.max(top - 6 * unit(), 16 * unit()), class: "photo-name", "font-size": 14 * unit() });
   name.textContent = object.label;
   const outline = svg("path", { d: object.outline.map(polygon).join(""), class: `photo-outline${isChosen ? " chosen" : ""}` });
   if (!isChosen) return [outline, name];
@@ -60,7 +60,11 @@ export function drawMarks(next, name) {
   }
   const picture = `api/photos/${photo.id}/photo.jpg?${new URLSearchParams({ focal: photo.focal_px })}`; // its lens may be another one
   if (byId("photo-image").getAttribute("href") !== picture) byId("photo-image").setAttribute("href", picture);
-  byId("photo-outlines").replaceChildren(...photo.objects.flatMap(marksOf));
+  drawObjects();
+}
+
+function drawObjects() {
+  byId("photo-outlines").replaceChildren(...(photo?.objects.flatMap(marksOf) ?? []));
 }
 
 /** Shows what was found, drawn from the photo's camera; "" where nothing is to be shown. */
@@ -138,6 +142,7 @@ export function setUpMarks({ onBox, onClick, onStroke }) {
     drag = null;
     byId("photo-drawn").replaceChildren();
   });
+  new ResizeObserver(drawObjects).observe(canvas); // names keep the size of the page's words
   byId("photo-wipe-at").addEventListener("input", wipe);
   byId("photo-drawing").addEventListener("error", () => setDrawing(""));
 }

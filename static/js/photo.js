@@ -1,6 +1,6 @@
 // Photos of tables: sent, marked, looked at; then one becomes the goal, or the table.
 import { get, getAll, patch, post, put, remove, upload } from "./api.js";
-import { byId, el } from "./dom.js";
+import { byId, el, shareOn } from "./dom.js";
 import { doubted } from "./doubt.js";
 import { mayDrive } from "./driver.js";
 import { takeGoal } from "./goals.js";
@@ -183,7 +183,7 @@ async function sendPhoto(file) {
   bar.value = 0;
   await tellFailure(async () => {
     const query = new URLSearchParams({ name: file.name.slice(-NAME_MAX) });
-    const sent = await upload(`photos?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");
+    const sent = await upload(`photos?${query}`, file, shareOn(bar), "application/octet-stream");
     await showPhoto(sent.id);
   }, byId("upload-table-photo"));
   bar.hidden = true;

@@ -1,7 +1,7 @@
 // One way in for any picture: one of the goal camera becomes the goal, a photograph opens so that objects can be marked.
 import { ApiError, problemOf, put, upload } from "./api.js";
 import { openCrop } from "./crop.js";
-import { byId, whileDisabled } from "./dom.js";
+import { byId, shareOn, whileDisabled } from "./dom.js";
 import { mayDrive } from "./driver.js";
 import { takeGoal } from "./goals.js";
 import { findObjects, showPhoto } from "./photo.js";
@@ -31,12 +31,8 @@ export async function sendPicture(file) {
   byId("goal-card").open = true;
   bar.hidden = false;
   bar.value = 0;
-  const onProgress = (share) => {
-    bar.value = share;
-    if (share === 1) bar.removeAttribute("value"); // it is being looked at now
-  };
   await tellFailure(async () => {
-    const { goal, photo } = await send("pictures", file, onProgress);
+    const { goal, photo } = await send("pictures", file, shareOn(bar));
     if (photo) {
       await showPhoto(photo.id);
       return;

@@ -1,5 +1,5 @@
 // The pictures of a step: goal, now, estimate and difference, a wipe between the first two, and the cameras. Goal and now
-// are over the 3D view as well, and the cameras in their strip, while a recording is on view.
+// are over the 3D view as well, and the cameras in their strip and enlarged, while a recording is on view.
 // They come as one image of two rows of four captioned tiles, of which each place shows its part.
 import { LatestImage } from "./cameras.js";
 import { byId, el } from "./dom.js";
@@ -74,7 +74,9 @@ export function setUpPictures() {
     alone.set(part.part, stand);
     byId(`pinned-${part.part}`).prepend(crop(part), stand);
   }
-  for (const [i, tile] of [...byId("camera-strip").children].entries()) tile.prepend(crop([...CAMERAS, PARTS[0]][i]));
+  const strip = [...CAMERAS, PARTS[0]];
+  for (const [i, tile] of [...byId("camera-strip").children].entries()) tile.prepend(crop(strip[i]));
+  byId("camera-dialog").append(...strip.map(crop));
   const [goal, now] = PARTS.slice(0, 2).map(crop);
   now.classList.add("over");
   byId("wipe-pair").append(goal, now);

@@ -6,6 +6,7 @@
 // that looks at a photo of a table, `photo` the one that is marked on this page, null if there is none.
 // `camera` is the calibrated one that was saved on this page, null if there is none.
 // `goal` is the one that was chosen on this page; `draft` the one that is being composed, null when there is none.
+// `push` is the one that is tried by hand, null when there is none.
 // `check` is what the service says of the goal and the table, null while it says nothing.
 // `driver` tells which visitor drives; `opened` is an episode that somebody wants to see, `report`
 // the one that was fetched last; `settings` what the form says, null if that cannot be used.
@@ -15,7 +16,7 @@
 const state = {
   scene: undefined, objects: [], fields: undefined, training: undefined, estimate: undefined, episode: undefined,
   objectWork: undefined, clip: undefined, photoJob: undefined, photo: null,
-  camera: null, goals: [], goal: null, check: null, draft: null, driver: null, opened: null, report: null, settings: null,
+  camera: null, goals: [], goal: null, check: null, draft: null, push: null, driver: null, opened: null, report: null, settings: null,
   recorded: false, robot: undefined, robotPictures: {},
 };
 const listeners = Object.fromEntries(Object.keys(state).map((what) => [what, []]));

@@ -4,6 +4,7 @@ import { drawLegend } from "./charts.js";
 import { COLOURS, svg } from "./curves.js";
 import { byId } from "./dom.js";
 import { startEpisode } from "./episode.js";
+import { showRunning } from "./episode-view.js";
 import { takeGoal } from "./goals.js";
 import { LIVE } from "./jobs.js";
 import { refreshObjects } from "./objects.js";
@@ -111,7 +112,7 @@ function open() {
   play();
 }
 
-/** Ends the story; the live table is on view again. */
+/** Ends the story; the live table is on view again, and the episode that runs. */
 function closeStory() {
   if (!isOn) return;
   isOn = false;
@@ -119,6 +120,7 @@ function closeStory() {
   show(false);
   sessionStorage.setItem(SEEN, "1");
   timeline.close();
+  showRunning();
 }
 
 // What to do next
@@ -170,7 +172,7 @@ export async function setUpStory() {
   byId("story-photo").addEventListener("click", usePhoto);
   byId("story-lamp").addEventListener("click", moveLamp);
   byId("story-button").addEventListener("click", open);
-  watch("episode", (job) => { byId("story-button").disabled = LIVE.has(job?.state); });
+  watch("episode", (job) => { run.hidden = LIVE.has(job?.state); });
   isOn = !byId("story-foot").hidden; // first-visit.js has made room
   const [answer] = await Promise.all([tellFailure(() => get("stories")), refreshObjects()]);
   // Those that can be run live come first.

@@ -1,15 +1,16 @@
 // The 3D view in its frame: the live table, or an episode in its place, as far as this page alone is concerned.
-import { VISITOR, post, put } from "./api.js";
+import { VISITOR, get, post, put } from "./api.js";
 import { byId } from "./dom.js";
 import { LIVE } from "./jobs.js";
 import { Newest } from "./newest.js";
-import { current, known, set, watch } from "./state.js";
+import { current, known, labelOf, set, watch } from "./state.js";
 import { tellFailure } from "./toasts.js";
 
 const FRAMES_PER_S = { rest: 12, start: 0.3, run: 2 }; // of a view that no graphics card draws: before the first push, and then
 
 let replayed = null; // what is replayed, as the service was told last
 let shows = "meshes";
+let handles = false;
 
 /** Whether an episode or estimate has been drawn on the table that is shown. */
 const drawsHere = (job) => Boolean(job) && job.state !== "queued" && job.params.scene === current()?.id;
@@ -30,7 +31,7 @@ export const isViewerShown = () => !byId("viewer").hidden;
 
 /** What is golden: the goal that was chosen, until an episode has found its own. */
 const golden = () => (drawsHere(known("episode")) && known("episode").done > 0 ? null : known("goal")?.id ?? null);
-const show = () => put(`views/${VISITOR}`, { replay: replayed, shows, goal: golden() });
+const show = () => put(`views/${VISITOR}`, { replay: replayed, shows, goal: golden(), handles });
 const wish = new Newest(show);
 
 /** Whether the service has a view of this page to draw in. */
@@ -46,6 +47,37 @@ export function replay(what) {
 
 export const showLive = () => replay(null);
 
+// Names of what the pointer rests on
+
+const REST_MS = 120;
+const NAMES = { pusher: "Pusher: drag it at an object", lamp: "Lamp: drag it" };
+
+/** Names things in the view's window while the pointer rests on them; a finger that taps does so, too. */
+function nameOnHover(view) {
+  const tip = byId("pointed");
+  let timer = 0;
+  const name = async ({ clientX: x, clientY: y }) => {
+    const { innerWidth: width, innerHeight: height } = view;
+    const query = new URLSearchParams({ x: x / width, y: y / height });
+    const pointed = (await get(`views/${VISITOR}/pointed?${query}`).catch(() => null))?.name;
+    if (!pointed || !timer) return; // has moved on
+    tip.textContent = NAMES[pointed] ?? labelOf(pointed);
+    tip.hidden = false;
+    tip.style.left = `${Math.min(Math.max(x, tip.offsetWidth / 2), width - tip.offsetWidth / 2)}px`;
+    tip.style.top = `${Math.max(y - tip.offsetHeight - 14, 0)}px`;
+  };
+  const leave = () => {
+    clearTimeout(timer);
+    timer = 0;
+    tip.hidden = true;
+  };
+  view.addEventListener("pointermove", (event) => {
+    leave();
+    if (!event.buttons) timer = setTimeout(name, REST_MS, event);
+  }, { passive: true });
+  for (const kind of ["pointerdown", "pointerout", "wheel"]) view.addEventListener(kind, leave, { passive: true });
+}
+
 /** A processor that also draws the view has more time for the search while there is one. */
 function pace(job) {
   const phase = !LIVE.has(job?.state) ? "rest" : job.done ? "run" : "start";
@@ -60,7 +92,8 @@ export function setUpViewer() {
   watch("episode", pace);
   byId("viewer").addEventListener("load", () => {
     paceAgain();
-    if (replayed || shows !== "meshes" || golden()) wish.ask(); // a service that was started again does not know
+    if (replayed || shows !== "meshes" || handles || golden()) wish.ask(); // a service that was started again does not know
+    nameOnHover(byId("viewer").contentWindow);
   });
   for (const what of ["episode", "estimate", "scene"]) watch(what, tellNothing);
   let drawn = golden();
@@ -72,6 +105,11 @@ export function setUpViewer() {
     });
   }
   byId("frame-view").addEventListener("click", () => tellFailure(() => post(`views/${VISITOR}/camera`)));
+  byId("show-handles").addEventListener("click", () => {
+    handles = !handles;
+    byId("show-handles").setAttribute("aria-pressed", handles);
+    wish.ask();
+  });
   for (const radio of document.getElementsByName("shows")) {
     radio.addEventListener("change", () => {
       shows = radio.value;

@@ -1,4 +1,4 @@
-"""How soon a first visitor sees something, how soon the first push comes, and what an open page costs. Run alone.
+"""How soon a visitor sees something and reaches what they came for, and what an open page costs. Run alone.
 
 python -m tests.bench.bench_page [--data-dir DIR] [--visits 3]
 """
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 import tyro
 from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
@@ -23,7 +24,8 @@ from tests.bench.machine import machine
 from tests.e2e.conftest import CHROMIUM, FLAGS
 from tests.live import live_service
 
-STORY_S, RUN_S, SETTLE_S, REST_S = 12, 12, 25, 20
+STORY_S, RUN_S, SETTLE_S, REST_S, TURN_S = 12, 12, 25, 20, 8
+PATIENCE_S = 300
 # Notes when texts of the page change, by its own clock: asking from outside would take time from what is measured.
 WATCH = """
 window.marks = [];
@@ -38,6 +40,22 @@ document.addEventListener("DOMContentLoaded", () => {
   watch("goal-check-text", (node) => `check ${node.textContent}`);
   document.getElementById("story-run").addEventListener("click", () => marks.push(["run", performance.now()]));
 });
+"""
+
+
+# Counts the pictures of the 3D view: its client draws one for each call of the browser.
+FRAMES = """
+window.drawn = 0;
+for (const kind of ["drawArrays", "drawElements"]) {
+  const natively = WebGL2RenderingContext.prototype[kind];
+  let last = 0;
+  WebGL2RenderingContext.prototype[kind] = function draw(...args) {
+    const now = document.timeline.currentTime;
+    if (now !== last) drawn += kind === "drawElements";
+    last = now;
+    return natively.apply(this, args);
+  };
+}
 """
 
 
@@ -81,6 +99,86 @@ def visit(browser: Browser, url: str, folder: Path) -> tuple[float, float, float
     check_s = first(marks_of(page), "check Nothing can be seen", before)
     page.context.close()
     return story_s, push_s, check_s
+
+
+class Hand:
+    """Counts what a person does on a page of their own, and the seconds since they began.
+
+    Args:
+        browser: whose page it is.
+        url: of the service.
+    """
+
+    def __init__(self, browser: Browser, url: str) -> None:
+        self.page = browser.new_context(viewport={"width": 1440, "height": 900}).new_page()
+        self.page.add_init_script("sessionStorage.setItem('osf-story-seen', '1')")
+        self.page.set_default_timeout(1000 * PATIENCE_S)
+        self.page.goto(url)
+        self.page.wait_for_selector("#poses tr", state="attached")
+        self.clicks, self._began = 0, time.monotonic()
+
+    def click(self, what: str) -> None:
+        """Click something once it is there."""
+        self.page.click(what)
+        self.clicks += 1
+
+    def reached(self, what: str) -> str:
+        """Wait for something to show; returns clicks and seconds so far."""
+        self.page.wait_for_selector(what)
+        return f"{self.clicks} clicks, {time.monotonic() - self._began:.1f} s"
+
+
+def ways(browser: Browser, url: str, folder: Path) -> Iterator[str]:
+    """Clicks and seconds from an open page to what somebody came for."""
+    hand = Hand(browser, url)
+    hand.click("#another-table")
+    hand.click("#random-goal")
+    hand.click("#start-episode:not([disabled])")
+    yield f"random table, first push: {hand.reached('#run-stage >> text=Pushing')}"
+    yield f"random table, over: {hand.reached('#ending:not([hidden])')} ({hand.page.inner_text('#shown-outcome')})"
+    hand.page.context.close()
+    hand = Hand(browser, url)
+    hand.click("#push-nearest")
+    yield f"a push predicted: {hand.reached('#push-execute:not([hidden])')}"
+    hand.page.context.close()
+    hand = Hand(browser, url)
+    hand.click("#tab-photo")
+    hand.click("#sample-photo")
+    yield f"sample photo, objects found: {hand.reached('#photo-result:not([hidden])')}"
+    hand.page.context.close()
+    trimesh.creation.box((0.05, 0.07, 0.12)).export(folder / "box.glb")
+    hand = Hand(browser, url)
+    hand.page.set_input_files("#own-object-file", folder / "box.glb")  # dropped anywhere
+    hand.clicks += 1
+    hand.click("#new-object [type=submit]")
+    hand.click("button:has-text('Put it on the table')")
+    hand.click("button:has-text('Push it')")
+    hand.page.keyboard.press("Enter")
+    yield f"own mesh, first push by hand: {hand.reached('#pad .held')}"
+    hand.page.context.close()
+
+
+def frames(browser: Browser, url: str) -> float:
+    """Pictures a second of the 3D view while somebody turns it."""
+    page = browser.new_page(viewport={"width": 1440, "height": 900})
+    page.add_init_script(FRAMES)
+    page.goto(url)
+    page.click("#back-to-live", timeout=30_000)
+    page.wait_for_timeout(1000 * SETTLE_S)
+    view = next(frame for frame in page.frames if "/viewer/" in frame.url)
+    box = page.locator("#viewer").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + 20
+    page.mouse.move(x, y)
+    page.mouse.down()
+    before, began = view.evaluate("drawn"), time.monotonic()
+    while time.monotonic() - began < TURN_S:
+        passed = time.monotonic() - began
+        page.mouse.move(x + 100 * np.sin(passed), y)
+    rate = (view.evaluate("drawn") - before) / (time.monotonic() - began)
+    page.mouse.up()
+    page.close()
+    return rate
 
 
 def cpu_seconds(parent: int) -> Counter[str]:
@@ -138,11 +236,16 @@ def main() -> None:
                 times.append(visit(browser, url, folder))
         with service(arguments.data_dir / "objects") as (url, _):
             cores = rest(browser, url)
+            rate = frames(browser, url)
+        with service(arguments.data_dir / "objects") as (url, folder):
+            for line in ways(browser, url, folder):
+                print(line, flush=True)
         browser.close()
     for text, values in zip(
         ("story on view", "run to first push", "blank photo refused"), np.transpose(times), strict=True
     ):
         print(f"{text}: " + ", ".join(f"{value:.2f}" for value in values) + " s")
+    print(f"3D view while it is turned: {rate:.1f} pictures a second")
     print("at rest: " + ", ".join(f"{who} {share:.3f} cores" for who, share in cores.items()))
 
 

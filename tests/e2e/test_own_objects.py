@@ -25,8 +25,10 @@ def url(library, tmp_path_factory):
     shutil.copytree(library.root, data_dir / "objects")
     (data_dir / "goals" / "half").mkdir(parents=True)
     (data_dir / "goals" / "half" / "goal.json").write_text('{"name": "Half of a')
-    with live_service(data_dir) as url:
-        yield url
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("https_proxy", "http://127.0.0.1:9")  # where nobody answers: it is without a network
+        with live_service(data_dir) as url:
+            yield url
 
 
 @pytest.fixture
@@ -101,6 +103,23 @@ def test_what_is_wrong_with_a_mesh_is_told_in_the_tab_and_the_form_can_be_used_a
     tile.get_by_text("Really delete").click()
     tile.wait_for(state="detached", timeout=WAIT_MS)
     assert page.problems == []
+
+
+def test_the_form_tells_of_the_latest_file(page):
+    choose(page, (60.0, 100.0, 80.0), "Red_box.glb")
+    choose(page, (60.0, 100.0, 80.0), "Blue_box.glb")
+    wait_until(lambda: page.inner_text("#own-object-state").startswith("Blue_box.glb"), 10)
+    assert page.inner_text("#own-object-file-name") == "Blue_box.glb"
+    assert page.input_value("#new-object [name=label]") == "Blue box"
+
+
+def test_whatever_is_missing_can_be_fetched_and_without_a_network_that_is_said(page):
+    page.wait_for_selector('[data-object="011_banana"]', timeout=WAIT_MS)
+    assert page.locator("#object-list li", has_text="not on this machine").count() > 10
+    for tile in page.locator("#object-list li", has_text="not on this machine").all():
+        assert tile.get_by_role("button", name="Fetch").count() == 1
+    page.get_by_role("button", name="Fetch: Banana").click()
+    wait_until(lambda: "network" in page.inner_text("#object-work-error"), WORK_S)
 
 
 def test_a_thumbnail_turns_under_the_pointer_and_stands_still_where_motion_is_unwanted(browser, url):

@@ -125,9 +125,19 @@ def test_it_runs_live_with_what_was_prepared_and_notices_a_turned_lamp(page, ser
     seen = "#camera-strip .part-of-frame"
     until(lambda: page.eval_on_selector(seen, "image => image.complete && image.naturalWidth > 1"))
     assert page.is_visible(seen)
+    page.click("#camera-strip button >> nth=1")
+    assert page.locator("#camera-dialog .part-of-frame:visible").count() == 1
+    assert not page.is_visible("#camera-large")  # what the camera sees now
+    page.keyboard.press("Escape")
     page.click("#back-to-live")
     assert not page.is_visible("#replaying")
     assert not page.is_visible(seen)
+    page.click("#story-button")
+    assert page.is_visible("#story-foot")
+    assert not page.is_visible("#story-run")  # one runs already
+    page.click("#back-to-live")
+    page.wait_for_selector("#shown:not([hidden])", timeout=WAIT_MS)
+    assert not page.is_visible("#story-foot")
     page.click("#fool-turn", timeout=WAIT_MS)
     until(lambda: "You: The lamp was moved" in page.inner_text("#noticed-large"))
     until(lambda: "found again" in page.inner_text("#noticed-large"))

@@ -108,6 +108,12 @@ def test_a_photo_becomes_the_goal(page, port, scene, photo, boxes):
     for name in TABLE:
         mark(page, name, boxes[name])
     assert page.locator("#photo-outlines path").count() == len(TABLE)
+    names, size = page.locator("#photo-outlines .photo-name"), page.viewport_size
+    before = names.first.bounding_box()["height"]
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.wait_for_timeout(300)
+    assert names.first.bounding_box()["height"] == pytest.approx(before, abs=2)  # as large, though the photo is smaller
+    page.set_viewport_size(size)
     page.click("#find-objects")
     page.wait_for_selector("#photo-result:not([hidden])", timeout=3 * WAIT_MS)
     assert page.locator(".photo-poses img").count() >= len(TABLE)

@@ -20,7 +20,6 @@ _FIELDS: Mapping[str, Set[str]] = {
     CAMERA: {
         "type", "wxyz", "position", "fov", "near", "far", "image_height", "image_width", "look_at", "up_direction",
     },
-    "GuiUpdateMessage": {"type", "uuid", "updates"},
     "TransformControlsUpdateMessage": {"type", "name", "wxyz", "position", "owner"},
     "TransformControlsDragStartMessage": {"type", "name", "owner"},
     DROP: {"type", "name", "owner"},
@@ -42,16 +41,7 @@ def allowed_kind(frame: bytes) -> str | None:
     kind = message.get("type")
     if not isinstance(kind, str) or kind not in _FIELDS or not message.keys() <= _FIELDS[kind]:
         return None
-    if kind == "GuiUpdateMessage":
-        updates = message.get("updates")
-        is_fine = isinstance(updates, dict) and updates.keys() == {"value"} and _is_value(updates["value"])
-    else:
-        is_fine = all(_is_plain(value) for value in message.values())
-    return kind if is_fine else None
-
-
-def _is_value(value: object) -> bool:
-    return _is_number(value) or (isinstance(value, str) and len(value) <= _MOST_TEXT)
+    return kind if all(_is_plain(value) for value in message.values()) else None
 
 
 def _is_plain(value: object) -> bool:
@@ -60,7 +50,7 @@ def _is_plain(value: object) -> bool:
         return True
     if isinstance(value, list):
         return len(value) <= 4 and all(_is_number(number) for number in value)
-    return _is_value(value)
+    return _is_number(value) or (isinstance(value, str) and len(value) <= _MOST_TEXT)
 
 
 def _is_number(value: object) -> bool:

@@ -14,6 +14,7 @@ from app.jobs.params import ImageCount, ImageSize, JobParams, ObjectCount, Objec
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
 from osfcore.io.files import file_at_once
+from osfcore.objects.catalogue import DEFAULT_NAMES
 from osfcore.objects.fetch import fetch, source_from
 
 if TYPE_CHECKING:
@@ -50,9 +51,9 @@ class CollectObjectParams(CollectTableParams):
 
 
 class FetchAssetsParams(JobParams):
-    """Objects to fetch from the package index."""
+    """Objects to fetch: from the package index, and from the official YCB download what that does not have."""
 
-    names: list[ObjectName] = Field(default=[], max_length=64, description="Empty for all that it has.")
+    names: list[ObjectName] = Field(default=[], max_length=64, description="Empty for all that the index has.")
 
 
 def _collect_pushes(params: CollectPushesParams, place: JobContext) -> Iterator[Any]:
@@ -88,8 +89,12 @@ def _collect_table(params: CollectTableParams, place: JobContext) -> Iterator[An
 
 
 def _fetch_assets(params: FetchAssetsParams, place: JobContext) -> Iterator[Any]:
-    source = source_from("pypi", place.data_dir / "downloads")
-    yield from fetch(tuple(params.names), source, place.library)
+    names = dict.fromkeys(params.names or DEFAULT_NAMES)
+    indexed = tuple(name for name in names if name in DEFAULT_NAMES)
+    others = tuple(name for name in names if name not in DEFAULT_NAMES)
+    for chosen, source in ((indexed, "pypi"), (others, "ycb")):
+        if chosen:
+            yield from fetch(chosen, source_from(source, place.data_dir / "downloads"), place.library)
 
 
 def _check_names(params: FetchAssetsParams, check_object: Callable[[str], object], available: int) -> None:

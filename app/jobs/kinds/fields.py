@@ -167,7 +167,7 @@ def _compared(step: TrainingStep, name: str, data: Path, shop: Path, place: JobC
     holdout = Holdout(read_image_set(data, "test"))
     before, new = FieldLibrary(place.data_dir).load(name), read_field(shop / FIELD_FILE)
     there, ours = holdout.everything(before), holdout.everything(new)
-    write_png(place.folder / COMPARISON, holdout.beside((before, new)))
+    write_png(place.folder / COMPARISON, _encoded(holdout.beside((before, new))))
     return replace(
         step,
         psnr_full=round(ours.psnr_full, 3),
@@ -233,11 +233,14 @@ def _train(
 
 
 def _for_eyes(strip: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Truth, rendering and difference with the first two as screens expect them: radiance itself looks nearly black."""
-    encoded = to_uint8(srgb_of_linear(np.arange(256) / 255))
-    shown, pictures = strip.copy(), 2 * strip.shape[1] // 3
-    shown[:, :pictures] = encoded[strip[:, :pictures]]
-    return shown
+    """Truth, rendering and difference, the first two as screens expect them."""
+    pictures = 2 * strip.shape[1] // 3
+    return np.hstack([_encoded(strip[:, :pictures]), strip[:, pictures:]])
+
+
+def _encoded(radiance: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Pictures as screens expect them: radiance itself looks nearly black."""
+    return to_uint8(srgb_of_linear(np.arange(256) / 255))[radiance]
 
 
 def _offer(shop: Path, folder: Path, name: str) -> None:

@@ -124,22 +124,6 @@ class CheckPhoto:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class RecogniseTable:
-    """Look whether a picture shows the table as a camera sees it. Answered by a bool.
-
-    Attributes:
-        key: different for every order, since none is to be left out.
-        camera: that may have taken the picture.
-        picture: PNG of the camera's size.
-    """
-
-    key: str
-    camera: Camera
-    picture: bytes
-    patience: ClassVar[int] = 0
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class PredictPushes:
     """Where sequences of actions would lead. Answered by Predicted, or by None if a newer order overtook it.
 
@@ -171,5 +155,5 @@ class Predicted:
     took_s: float
 
 
-Order = DrawView | CompareView | DrawPhoto | CheckPhoto | RecogniseTable | PredictPushes
-NeuralAnswer = DrawnView | Comparison | ContentCheck | Predicted | bytes | bool | None
+Order = DrawView | CompareView | DrawPhoto | CheckPhoto | PredictPushes
+NeuralAnswer = DrawnView | Comparison | ContentCheck | Predicted | bytes | None

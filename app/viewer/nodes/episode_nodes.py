@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import viser
@@ -12,14 +11,12 @@ from jaxtyping import Float, UInt8
 
 from app.viewer.nodes.estimate_nodes import EstimateNodes
 from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of, segments, shell
-from app.viewer.nodes.room import GAMMA, NO_LINES, Colour, Label, Target, atomic, colour_of
+from app.viewer.nodes.room import GAMMA, NO_LINES, Colour, Target, atomic, colour_of
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.planning.mppi import PlanSketch
 
-Part = Literal["goal", "plan", "estimate"]
-PARTS: tuple[Part, ...] = ("goal", "plan", "estimate")
 GOAL = (245, 140, 0)
 CHEAP, DEAR = (45, 215, 90), (150, 62, 58)
 GOAL_OPACITY = 0.6
@@ -35,28 +32,18 @@ class EpisodeNodes:
     Args:
         server: to draw in.
         library: meshes of the objects.
-        names: the objects' names that are on view already, by object.
         root: below which everything is drawn.
     """
 
-    def __init__(
-        self,
-        server: Target,
-        library: AssetLibrary,
-        names: Callable[[], Mapping[str, Label]] = dict,
-        *,
-        root: str = "/episode",
-    ) -> None:
+    def __init__(self, server: Target, library: AssetLibrary, *, root: str = "/episode") -> None:
         self._root = root
         self._server = server
         self._scene = server.scene
         self._library = library
         self._lock = threading.RLock()
-        # What is below a hidden node is hidden with it.
-        self._roots = {part: self._scene.add_frame(f"{root}/{part}", show_axes=False) for part in PARTS}
-        self._now = EstimateNodes(server, library, names, root=f"{root}/estimate")
+        self._now = EstimateNodes(server, library, root=f"{root}/estimate")
         self._goal_look = EstimateNodes(
-            server, library, names, root=f"{root}/goal/look", colour=_linear(GOAL), has_light=False
+            server, library, root=f"{root}/goal/look", colour=_linear(GOAL), has_light=False
         )
         self._goal: dict[str, viser.MeshHandle] = {}
         self._future = FutureNodes(server.scene, library, f"{root}/plan/future", FutureStyle(_linear(PREDICTED)))
@@ -65,16 +52,6 @@ class EpisodeNodes:
         each = np.array([[_linear(CHEAP)] * 2], np.uint8)
         self._ways = add(f"{root}/plan/ways", NO_LINES, each, thickness=_WAY_M, visible=False)
         self._best = add(f"{root}/plan/best", NO_LINES, PREDICTED, thickness=_BEST_M, visible=False)
-
-    @property
-    def shows_light(self) -> bool:
-        """Whether an estimated light is on view."""
-        return self._roots["estimate"].visible and not self._now.is_empty
-
-    def show_part(self, part: Part, is_on: bool) -> None:
-        """Show or hide a part of it, whatever is in there now or later."""
-        with self._lock:
-            self._roots[part].visible = is_on
 
     def show_goal(self, poses: Mapping[str, Pose]) -> None:
         """Show where objects should be in place of the former goal; of none, nothing."""
@@ -129,7 +106,7 @@ class EpisodeNodes:
     def play_to(self, share: float) -> None:
         """Let the best future be as it is after a share of its time."""
         with self._lock:
-            if self._future.steps and self._roots["plan"].visible:
+            if self._future.steps:
                 with atomic(self._server):
                     self._future.at(self._future.steps * share)
 

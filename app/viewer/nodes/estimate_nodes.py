@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,7 @@ from app.viewer.nodes.ghosts import (
     spread,
     top_m,
 )
-from app.viewer.nodes.room import AT, LIGHT_COLOUR, NO_TURN, Colour, Label, LightMarker, Target, atomic, separated
+from app.viewer.nodes.room import AT, LIGHT_COLOUR, NO_TURN, Colour, LightMarker, Target, atomic, separated
 from osfcore.estimation.steps import UNPLACED_BELOW_M
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -83,7 +83,6 @@ class EstimateNodes:
     Args:
         server: to draw in.
         library: meshes of the objects.
-        names: the objects' names that are on view already, by object.
         root: the node.
         colour: of the guess.
         has_light: whether the light is drawn, too.
@@ -93,7 +92,6 @@ class EstimateNodes:
         self,
         server: Target,
         library: AssetLibrary,
-        names: Callable[[], Mapping[str, Label]] = dict,
         *,
         root: str = "/estimate",
         colour: Colour = GUESS,
@@ -101,20 +99,13 @@ class EstimateNodes:
     ) -> None:
         self._root, self._colour, self._has_light = root, colour, has_light
         self._server = server
-        self._named = names
         self._scene = server.scene
         self._library = library
         self._lock = threading.RLock()
         self._objects: dict[str, _ObjectNodes] = {}
         self._verdicts: list[viser.SceneNodeHandle] = []
-        self._has_candidates = True
-        self._lamp: LightMarker | None = None
+        self._lamps: dict[bool, LightMarker] = {}  # by whether things are on their way
         self._tried_lights = self._add_tried("tried_lights", box(_TRIED_LIGHT_M), LIGHT_COLOUR, 0.5)
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether nothing is drawn."""
-        return not self._objects and self._lamp is None
 
     def show(
         self,
@@ -136,8 +127,8 @@ class EstimateNodes:
                 nodes.place(state.poses[n], is_tracked=False)
                 if candidates is not None:
                     move_ghosts(nodes.tried, spread(candidates[:, n], GHOSTS))
-                nodes.tried.visible = candidates is not None and self._has_candidates
-            self._show_light(state.light, lights, "guessed light")
+                nodes.tried.visible = candidates is not None
+            self._show_light(state.light, "guessed light", lights)
             if estimate is not None:
                 self._judge(estimate)
 
@@ -153,22 +144,15 @@ class EstimateNodes:
                 nodes.place(state.poses[n], is_tracked=True)
                 nodes.tried.visible = False
                 nodes.paint(_DOUBTED if doubts[n] else _SURE)
-            self._show_light(state.light, None, "estimated light")
-
-    def show_candidates(self, is_on: bool) -> None:
-        """Show or hide what is tried."""
-        with self._lock:
-            self._has_candidates = is_on
-            for node in (*(nodes.tried for nodes in self._objects.values()), self._tried_lights):
-                node.visible = is_on and node.visible
+            self._show_light(state.light, "estimated light", is_tracked=True)
 
     def clear(self) -> None:
         """Remove everything."""
         with self._lock, atomic(self._server):
             self._begun(())
-            if self._lamp is not None:
-                self._lamp.remove()
-            self._lamp, self._tried_lights.visible = None, False
+            while self._lamps:
+                self._lamps.popitem()[1].remove()
+            self._tried_lights.visible = False
 
     def _begun(self, names: tuple[str, ...]) -> Iterable[_ObjectNodes]:
         """Remove the last verdict, and make nodes if these are other objects than before."""
@@ -194,22 +178,27 @@ class EstimateNodes:
     def _add_tried(self, path: str, mesh: Mesh, colour: Colour, opacity: float) -> viser.BatchedMeshHandle:
         return add_ghosts(self._scene, f"{self._root}/{path}", mesh, GHOSTS, colour, opacity)
 
-    def _show_light(self, light: Light, tried: np.ndarray | None, text: str) -> None:
+    def _show_light(
+        self, light: Light, text: str, tried: np.ndarray | None = None, *, is_tracked: bool = False
+    ) -> None:
         if not self._has_light:
             return
-        self._lamp = self._lamp or LightMarker(self._scene, f"{self._root}/light", is_below=True)
-        self._lamp.place(light.position)
-        self._lamp.show(text=text)
+        if is_tracked not in self._lamps:
+            path = f"{self._root}/{TRACKED}/light" if is_tracked else f"{self._root}/light"
+            self._lamps[is_tracked] = LightMarker(self._scene, path, is_below=True)
+        for of, lamp in self._lamps.items():
+            lamp.show(is_on=of == is_tracked, text=text)
+        self._lamps[is_tracked].place(light.position)
         if tried is not None:
             turns = np.tile(NO_TURN, (len(tried), 1))
             move_ghosts(self._tried_lights, spread(Pose(AT * np.asarray(tried, float), turns), GHOSTS))
-        self._tried_lights.visible = tried is not None and self._has_candidates
+        self._tried_lights.visible = tried is not None
 
     # The verdict
 
     def _judge(self, estimate: EstimatedState) -> None:
-        """Say how sure each pose is, or why it is doubted, above the object and clear of all names."""
-        standing, texts, anchors = self._named(), [], []
+        """Say how sure each pose is, or why it is doubted, above the object and clear of the others."""
+        texts, anchors = [], []
         for n, (name, nodes) in enumerate(self._objects.items()):
             pose, doubt = estimate.state.poses[n], estimate.doubts[n]
             nodes.paint(_DOUBTED if doubt else _SURE)
@@ -218,15 +207,15 @@ class EstimateNodes:
             far_mm, turn_deg = 1000 * _SIGMAS * estimate.position_std[n], np.rad2deg(_SIGMAS * estimate.rotation_std[n])
             text = f"± {_two_digits(far_mm)} mm, ± {_two_digits(turn_deg)}° ({_SIGMAS:.0f}σ)"
             text = f"DOUBTFUL: {doubt}" if doubt else text
-            texts.append(text if name in standing else f"{self._library.label(name)}: {text}")
+            texts.append(f"{self._library.label(name)}: {text}")
             anchors.append(top + np.array([0.0, 0.0, _LABEL_M]))
-        places = separated(np.array(anchors).reshape(-1, 3), texts, tuple(standing.values()))
+        places = separated(np.array(anchors).reshape(-1, 3), texts)
         for name, text, at in zip(self._objects, texts, places, strict=True):
             path = f"{self._root}/verdict/{name}/words"
             words = self._scene.add_label(path, text, position=at, font_screen_scale=0.75, anchor="bottom-center")
             self._verdicts.append(words)
         within = f"± {_two_digits(np.rad2deg(_SIGMAS * estimate.light_std))}° ({_SIGMAS:.0f}σ)"
-        self._show_light(estimate.state.light, None, f"estimated light {within}")
+        self._show_light(estimate.state.light, f"estimated light {within}")
 
     def _add_bounds(self, estimate: EstimatedState, n: int, top: Float[np.ndarray, "3"]) -> None:
         """Add a ball of two standard deviations on an object's top, and a sector of two around its heading."""

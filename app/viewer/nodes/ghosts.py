@@ -52,6 +52,14 @@ def coarse(vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], ce
     return merged.astype(np.float32), kept[np.sort(first)].astype(np.uint32)
 
 
+def size_m(library: AssetLibrary, name: str) -> Float[np.ndarray, "3"]:
+    """Return the size of an object [m]; that of a cube for one that was removed since."""
+    try:
+        return library.size_m(name)
+    except OsfError:
+        return np.full(3, UNKNOWN_M)
+
+
 def mesh_of(library: AssetLibrary, name: str, cells: int = CELLS) -> Mesh:
     """Load the coarse mesh of an object.
 

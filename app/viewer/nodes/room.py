@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -132,22 +131,7 @@ CHARACTER, LINE = 0.011, 0.032  # width of a character and height of a label, as
 _RISE_M = 0.02
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Label:
-    """A label in the 3D view.
-
-    Attributes:
-        text: what it says.
-        anchor_m: the middle of its foot, in the world [m].
-    """
-
-    text: str
-    anchor_m: Float[np.ndarray, "3"]
-
-
-def separated(
-    anchors_m: Float[np.ndarray, "N 3"], texts: Sequence[str], standing: Sequence[Label] = ()
-) -> Float[np.ndarray, "N 3"]:
+def separated(anchors_m: Float[np.ndarray, "N 3"], texts: Sequence[str]) -> Float[np.ndarray, "N 3"]:
     """Raise the anchors of labels where one would cover another, as the view is at first.
 
     A label stands on its anchor. From the lowest in the view to the highest, each is raised until it is clear of those
@@ -156,16 +140,12 @@ def separated(
     Args:
         anchors_m: where each would stand best, in the world [m].
         texts: of the labels.
-        standing: labels that are on view already, and stay.
     """
     view = Camera.look_at("view", VIEW_FROM, VIEW_AT, fov_y_deg=float(np.rad2deg(VIEW_FOV_RAD)))
     place = view.project(anchors_m) / view.height
     higher = view.project(anchors_m + np.array([0, 0, _RISE_M])) / view.height
     raised = anchors_m.copy()
     taken: list[tuple[float, float, float]] = []  # middle, half width and foot of labels that have their place
-    for label in standing:
-        middle, foot = view.project(label.anchor_m[None])[0] / view.height
-        taken.append((middle, CHARACTER * len(label.text) / 2, foot))
     for n in np.argsort(-place[:, 1], kind="stable"):
         (middle, foot), half = place[n], CHARACTER * len(texts[n]) / 2
         for other_middle, other_half, other_foot in sorted(taken, key=lambda label: -label[2]):
@@ -178,7 +158,7 @@ def separated(
 
 # Lights
 
-LIGHT_COLOUR, NAMED_LIGHT_COLOUR = (40, 200, 60), (230, 185, 40)
+LAMP_COLOUR, LIGHT_COLOUR = (255, 210, 70), (40, 200, 60)  # the true one, and what is taken for it
 AT = 0.5  # where the dot stands on the way from the table's centre to the light
 _RAY = (0.35, AT)  # where the line begins and ends
 _DOT_PX, _RAY_PX = 15.0, 2.5

@@ -11,24 +11,20 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.nodes.ghosts import UNKNOWN_M, Mesh, box
+from app.viewer.nodes.ghosts import UNKNOWN_M, Mesh, box, size_m
 from app.viewer.nodes.room import (
     AT,
     GAMMA,
-    LIGHT_COLOUR,
-    NAMED_LIGHT_COLOUR,
+    LAMP_COLOUR,
     NO_TURN,
-    Label,
     LightMarker,
     Target,
     atomic,
     colour_of,
     put,
     send_again,
-    separated,
 )
 from osfcore.errors import OsfError
-from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose, quaternion_multiply, quaternion_to_matrix
 from osfcore.geometry.states import SceneState
@@ -38,14 +34,16 @@ from osfcore.world.imaging import TABLE_ALBEDO
 
 # Everything that is drawn of the live table, here and elsewhere; the room around it is not.
 LIVE_NODES = (
-    "/objects", "/names", "/handles", "/shadows", "/cameras", "/pusher", "/light", "/light_ray", "/light_name",
+    "/objects", "/handles", "/shadows", "/pusher", "/light", "/light_ray", "/light_name",
     "/episode", "/estimate", "/push", "/goal",
 )  # fmt: skip
 # A browser's own lamp takes the place of the one for all, wherever its other nodes are: the table is dark while a lamp
 # that was hidden is put up again.
 LAMP = "/lamp"
-LABEL_GAP_M = 0.01
 _SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])  # of the corners of a box
+_PUSHER_M = np.array([2 * PUSHER_RADIUS_M, 2 * PUSHER_RADIUS_M, PUSHER_HEIGHT_M])
+PUSHER_NAME, LAMP_NAME = "pusher", "lamp"  # of what is no object
+_MARK_RAD = 0.02  # as seen from the eye, half of the lamp's mark
 _BALL_M, _BALL_OPACITY = 0.04, 0.1
 _BELOW_M = 0.06  # a hand that takes the lowest light by the lower half of its ball points below the table
 _log = logging.getLogger(__name__)
@@ -61,7 +59,6 @@ class SceneNodes:
         on_move: called on viser's loop with name, pose [m, world] and client when an object was let go; None where
             objects have no handles.
         on_light: called on viser's loop with light and client when the light was let go; None likewise.
-        cameras: that are drawn.
         root: below which everything but the lamp is drawn.
 
     Attributes:
@@ -75,7 +72,6 @@ class SceneNodes:
         on_move: Callable[[str, Pose, Client], None] | None = None,
         on_light: Callable[[Light, Client], None] | None = None,
         *,
-        cameras: tuple[Camera, ...] = (),
         root: str = "",
     ) -> None:
         self._server, self._root = server, root
@@ -85,15 +81,11 @@ class SceneNodes:
         self._on_change: Callable[[], object] = tuple
         self._lock = threading.RLock()
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
-        self._labels: dict[str, viser.LabelHandle] = {}
         self._gizmos: dict[str, viser.SceneNodeHandle] = {}
-        self._sizes_m: dict[str, np.ndarray] = {}
         # What someone is dragging follows the hand, not the scene.
         self._grabbed: dict[str, np.ndarray] = {}
         self._is_light_held = False
-        self._has_names = True
         self._has_gizmos = self._is_grabbable = False
-        self._light_requests: dict[str, tuple[bool, str]] = {}  # whether it is visible, and the text beside it
         self._shadows = ShadowNodes(self._scene, library, f"{root}/shadows")
         self.pusher = self._scene.add_cylinder(
             f"{root}/pusher",
@@ -109,14 +101,13 @@ class SceneNodes:
         self._place_light(np.array(start))
         if on_light is not None:
             self._let_drag_light(on_light)
-        self._frustums = {camera.name: self._frustum(camera) for camera in cameras}
 
     def show(self, state: SceneState | None) -> None:
         """Begin with a state of any objects, or clear the table."""
         names = () if state is None else state.names
         with self._lock, atomic(self._server):  # what was on the table before is never seen on the new one
             for name in set(self._bodies) - set(names):
-                for nodes in (self._bodies, self._labels, self._gizmos):
+                for nodes in (self._bodies, self._gizmos):
                     if name in nodes:
                         nodes.pop(name).remove()
             for name in names:
@@ -125,9 +116,7 @@ class SceneNodes:
             self._grabbed.clear()
             self._is_light_held = False
             self.pusher.visible = state is not None
-            self._show_light()
-            for frustum in self._frustums.values():
-                frustum.image = None
+            self._marker.show(has_ray=state is not None, colour=LAMP_COLOUR)
             self._shadows.show(None)
             if state is not None:
                 self.place(state)
@@ -155,52 +144,12 @@ class SceneNodes:
                     put(self._bodies[name], pose.position, pose.quaternion)
                     if name in self._gizmos:
                         put(self._gizmos[name], pose.position, NO_TURN)
-            self._place_labels()
             if state.pusher is not None:
                 put(self.pusher, state.pusher)
             if not self._is_light_held:
                 self._place_light(state.light.position)
             self._draw_shadows()
         self._on_change()
-
-    def show_frames(self, names: tuple[str, ...], images: np.ndarray) -> None:
-        """Put live images into the cameras' frustums."""
-        with self._lock:
-            for name, image in zip(names, images, strict=True):
-                if name in self._frustums:
-                    self._frustums[name].image = image
-
-    def names(self) -> dict[str, Label]:
-        """The names of objects that are on view, by object."""
-        with self._lock:
-            shown = {name: label for name, label in self._labels.items() if label.visible}
-            return {name: Label(label.text, np.asarray(label.position, float)) for name, label in shown.items()}
-
-    def show_cameras(self, is_on: bool) -> None:
-        """Show or hide the cameras."""
-        for frustum in self._frustums.values():
-            frustum.visible = is_on
-
-    def show_lamp(self, *, is_on: bool, name: str = "", by: str = "") -> None:
-        """Show or hide the scene's own light; with a name, in another colour than estimated lights.
-
-        Each panel that draws estimates has a request of its own: the light is as usual once all requests are the usual.
-
-        Args:
-            is_on: whether it is visible.
-            name: text beside it.
-            by: the panel that requests it.
-        """
-        with self._lock:
-            self._light_requests[by] = is_on, name
-            self._show_light()
-
-    def show_names(self, is_on: bool) -> None:
-        """Show or hide the objects' names."""
-        with self._lock:
-            self._has_names = is_on
-            for label in self._labels.values():
-                label.visible = is_on
 
     def show_gizmos(self, is_on: bool) -> None:
         """Show or hide the handles for moving objects."""
@@ -229,7 +178,7 @@ class SceneNodes:
         ball = self._scene.add_icosphere(
             f"{self._root}/light/ball",
             _BALL_M,
-            LIGHT_COLOUR,
+            LAMP_COLOUR,
             opacity=_BALL_OPACITY,
             cast_shadow=False,
             receive_shadow=False,
@@ -258,35 +207,13 @@ class SceneNodes:
 
         ball.on_drag(drag)
 
-    def _frustum(self, camera: Camera) -> viser.CameraFrustumHandle:
-        pose = camera.T_world_camera
-        return self._scene.add_camera_frustum(
-            f"/cameras/{camera.name}",
-            fov=camera.fov_y_rad,
-            aspect=camera.width / camera.height,
-            scale=0.06,
-            thickness=0.003,
-            color=(90, 100, 115),
-            wxyz=pose.quaternion,
-            position=pose.position,
-            cast_shadow=False,
-            receive_shadow=False,
-            visible=False,  # one stands between most views and the table
-        )
-
     def _add_object(self, name: str) -> None:
         try:
             body = self._scene.add_glb(f"{self._root}/objects/{name}", self._library.viewer_glb(name))
-            self._sizes_m[name] = self._library.size_m(name)
-            label = self._library.info(name).label
-        except OsfError as error:  # removed or damaged since the scene was made: its name still shows where it is
+        except OsfError as error:  # removed or damaged since the scene was made: a mark still shows where it is
             _log.warning("%s is not drawn: %s", name, error)
             body = self._scene.add_frame(f"{self._root}/objects/{name}", axes_length=0.05, axes_radius=0.002)
-            label = name
         self._bodies[name] = body
-        self._labels[name] = self._scene.add_label(
-            f"{self._root}/names/{name}", label, visible=self._has_names, font_screen_scale=0.8, anchor="bottom-center"
-        )
         if self._on_move is not None:
             self._gizmos[name] = self._add_handle(name, self._on_move)
             self._bind_drag(name)
@@ -322,9 +249,8 @@ class SceneNodes:
         body.on_drag(drag)
 
     def _carry(self, body: viser.SceneNodeHandle, pose: Pose) -> None:
-        """Move an object with a hand, and with it the names and shadows."""
+        """Move an object with a hand, and with it the shadows."""
         put(body, pose.position, pose.quaternion)
-        self._place_labels()
         self._draw_shadows()
 
     def _add_handle(self, name: str, on_move: Callable[[str, Pose, Client], None]) -> viser.TransformControlsHandle:
@@ -348,19 +274,6 @@ class SceneNodes:
         gizmo.on_update(drag)
         return gizmo
 
-    def _place_labels(self) -> None:
-        """Put the names above the tops of their objects, clear of each other."""
-        if not self._labels:
-            return
-        anchors = []
-        for name in self._labels:
-            body, size_m = self._bodies[name], self._sizes_m.get(name, np.zeros(3))
-            top_m = float(np.abs(quaternion_to_matrix(np.asarray(body.wxyz))[2]) @ size_m / 2)
-            anchors.append(np.asarray(body.position, float) + np.array([0.0, 0.0, top_m + LABEL_GAP_M]))
-        texts = [label.text for label in self._labels.values()]
-        for label, anchor in zip(self._labels.values(), separated(np.array(anchors), texts), strict=True):
-            put(label, anchor)
-
     def _draw_shadows(self) -> None:
         if self._bodies:
             self._shadows.show(self.state())
@@ -368,13 +281,6 @@ class SceneNodes:
     def _place_light(self, position: np.ndarray) -> None:
         put(self._lamp, position)
         self._marker.place(position)
-
-    def _show_light(self) -> None:
-        """Show the light's mark as the panels request it."""
-        others = [request for request in self._light_requests.values() if request != (True, "")]
-        is_on, name = max(others, default=(True, ""))
-        colour = NAMED_LIGHT_COLOUR if name else LIGHT_COLOUR
-        self._marker.show(is_on=is_on, has_ray=self.pusher.visible, text=name, colour=colour)
 
 
 def level_point(
@@ -430,15 +336,41 @@ def extent_m(
     """
     corners = [np.asarray(AT * state.light.position)[None]]
     if state.pusher is not None:
-        half = np.array([PUSHER_RADIUS_M, PUSHER_RADIUS_M, PUSHER_HEIGHT_M / 2])
-        corners.append(state.pusher + half * _SIGNS)
+        corners.append(state.pusher + _PUSHER_M / 2 * _SIGNS)
     for name, pose in (*((name, state.pose(name)) for name in state.names), *goal):
-        try:
-            half = library.size_m(name) / 2
-        except OsfError:  # removed since
-            half = np.full(3, UNKNOWN_M / 2)
-        corners.append(pose.apply(half * _SIGNS))
+        corners.append(pose.apply(size_m(library, name) / 2 * _SIGNS))
     return np.concatenate(corners)
+
+
+def pointed_at(
+    state: SceneState, library: AssetLibrary, eye: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"]
+) -> str | None:
+    """Return what a ray meets first: an object by the box around it, the pusher, the lamp by its mark, or nothing.
+
+    Args:
+        state: the scene.
+        library: sizes of the objects.
+        eye: where the ray begins [m].
+        way: where it leads.
+    """
+    mark = AT * state.light.position - eye
+    if mark @ way > np.cos(_MARK_RAD) * np.linalg.norm(mark) * np.linalg.norm(way):
+        return LAMP_NAME
+    boxes = [(name, state.pose(name), size_m(library, name)) for name in state.names]
+    if state.pusher is not None:
+        boxes.append((PUSHER_NAME, Pose(state.pusher, NO_TURN), _PUSHER_M))
+    met = {name: at for name, pose, sides_m in boxes if np.isfinite(at := _enters(pose, sides_m, eye, way))}
+    return min(met, key=met.__getitem__, default=None)
+
+
+def _enters(pose: Pose, sides_m: np.ndarray, eye: np.ndarray, way: np.ndarray) -> float:
+    """Where a ray enters a box around a pose, in lengths of the ray; infinite if it misses (Kay and Kajiya 1986)."""
+    axes = quaternion_to_matrix(pose.quaternion)
+    start, slope = (eye - pose.position) @ axes, way @ axes
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sides = np.stack([(-sides_m / 2 - start) / slope, (sides_m / 2 - start) / slope])
+    near, far = np.nanmax(sides.min(axis=0)), np.nanmin(sides.max(axis=0))
+    return float(near) if 0 < near <= far else np.inf
 
 
 def light_toward(position: np.ndarray) -> Light | None:

@@ -135,6 +135,18 @@ def test_notices_reach_the_page(live):
         assert stream.next("notice")[2] == {"level": "warning", "text": "Mind the\nstep."}
 
 
+def test_a_push_is_told_to_every_page_and_to_those_that_come_later(live, shown):
+    with Stream(live) as stream:
+        live.request("PUT", "/api/push", {})
+        told = stream.next("push")[2]
+        assert (told["scene"], told["revision"]) == (shown["id"], shown["revision"])
+        with Stream(live) as later:
+            assert later.next("push")[2]["actions"] == told["actions"]
+        live.request("DELETE", "/api/push")
+        while told is not None:
+            told = stream.next("push")[2]
+
+
 def test_a_draft_is_told_to_every_page_and_to_those_that_come_later(live, shown):
     (thing,) = shown["objects"]
     with Stream(live) as stream:

@@ -10,7 +10,7 @@ from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.states import EstimatedState
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M
 from osfcore.io.scene_file import Scene, estimated_to_json, scene_to_json
-from tests.app.conftest import running
+from tests.app.conftest import running, until
 from tests.app.processes.fields import write_box
 from tests.app.storage.test_database import record
 from tests.support.errors import about
@@ -106,6 +106,29 @@ def test_mistakes_are_told_in_one_sentence(service, body, words):
     assert answer.status_code == 422
     assert answer.headers["content-type"] == "application/problem+json"
     assert words in answer.text
+
+
+def test_a_push_is_tried_on_the_table_that_is_shown(service, scene):
+    assert service.delete("/api/push").status_code == 204
+    assert service.get("/api/push").status_code == 404
+    assert service.post("/api/push/execute").status_code == 409
+    x, y, _ = scene["pusher"]["position"]
+    chosen = service.put("/api/push", json={"target": [x + 0.1, y], "speed": 0.25})
+    assert chosen.status_code == 200, chosen.text
+    assert chosen.json()["revision"] == scene["revision"]
+    np.testing.assert_allclose(np.sum(chosen.json()["actions"], axis=0), [0.5, 0, 0], atol=1e-9)
+    until(lambda: service.get("/api/push").json()["state"] == "predicted")
+    assert [row["name"] for row in service.get("/api/push").json()["objects"]] == [o["name"] for o in scene["objects"]]
+    done = service.post("/api/push/execute").json()
+    assert done["state"] == "executed"
+    assert all(row["off_mm"] is not None for row in done["objects"])
+    moved = service.get(f"/api/scenes/{scene['id']}").json()
+    assert moved["pusher"]["position"][0] == pytest.approx(x + 0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("body", [{"target": [0.1]}, {"target": ["a", 0]}, {"speed": 3}, {"speed": 0}, {"way": 1}])
+def test_mistakes_in_a_push_are_refused(service, scene, body):
+    assert service.put("/api/push", json=body).status_code == 422
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])

@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 
 from app.viewer.private_server import SECRET_HEADER
 from tests.app.conftest import until
-from tests.app.viewer.conftest import uuid_of
+from tests.app.viewer.conftest import CAMERA, uuid_of
 
 PROTOCOL = f"viser-v{viser.__version__}"
 
@@ -94,7 +94,8 @@ def test_the_inner_port_is_closed_to_all_but_the_relay(live, headers):
 
 
 def test_a_message_that_the_page_never_sends_changes_nothing(live):
-    button = live.services.viewer.server.gui.add_button("Test")
+    server = live.services.viewer.server
+    button = server.gui.add_button("Test")
     try:
         with viewer_socket(live) as browser:
             browser.recv(timeout=10)
@@ -102,7 +103,9 @@ def test_a_message_that_the_page_never_sends_changes_nothing(live):
                 browser.send(
                     msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": uuid_of(button), "updates": updates})
                 )
-            until(lambda: button.value)
+            browser.send(msgspec.msgpack.encode(CAMERA))  # is heard after the others
+            until(lambda: any(client.camera.fov == CAMERA["fov"] for client in server.get_clients().values()))
+            assert not button.value
             assert not button.disabled
     finally:
         button.remove()

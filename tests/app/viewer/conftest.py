@@ -7,14 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import viser
-from viser._gui_handles import GuiProgressBarHandle
 
 from app.viewer.nodes.room import AT
 from app.viewer.private_server import PrivateViser
 from tests.app.conftest import until
 
 BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [1.0, 1.0, 1.0], "fov": 0.8, "near": 0.01,
+    "far": 10.0, "image_height": 100, "image_width": 100, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0],
+}  # fmt: skip
 
 
 def uuid_of(element):
@@ -25,62 +27,15 @@ def uuid_of(element):
 class ViewerDriver:
     """What a browser shows of a viser server, and what people do in it.
 
-    viser can neither list the elements of its panel nor act as a browser, so its private state is read here, and only
-    here.
+    viser can neither list its nodes nor act as a browser, so its private state is read here, and only here.
 
     Args:
-        server: whose panel and scene are driven.
+        server: whose scene is driven.
         client: who acts, as callbacks are told.
     """
 
     def __init__(self, server, client=None):
         self.server, self.client = server, client
-
-    def _elements(self, container, folder=""):
-        for element in list(container._children.values()):
-            yield folder, element
-            if isinstance(element, viser.GuiFolderHandle):
-                yield from self._elements(element, element.label)
-
-    def elements(self, what, folder=None):
-        """Elements with a label, or of a type; all, or those in a folder ("" for those in none)."""
-        return [
-            element
-            for of, element in self._elements(self.server.gui._container_handle_from_uuid["root"])
-            if folder in (None, of)
-            and (isinstance(element, what) if isinstance(what, type) else getattr(element, "label", None) == what)
-        ]
-
-    def element(self, what, folder=None):
-        (element,) = self.elements(what, folder)
-        return element
-
-    def progress(self, folder=None):
-        """Percent that a progress bar shows; None while there is none to see."""
-        (bar,) = self.elements(GuiProgressBarHandle, folder)
-        return bar.value if bar.visible else None
-
-    def text(self, folder=None):
-        """HTML that is visible."""
-        return "".join(html.content for html in self.elements(viser.GuiHtmlHandle, folder) if html.visible)
-
-    def says(self, words):
-        until(lambda: words in self.text())
-
-    def press(self, label, value=None, *, folder=None):
-        """Click a button, or the one of a group that is called `value`."""
-        button = self.element(label, folder)
-        self._tell(button, button if value is None else SimpleNamespace(value=value))
-
-    def set(self, label, value, *, folder=None):
-        """Give an element a value, which browsers do not check."""
-        element = self.element(label, folder)
-        element._impl.value = value
-        self._tell(element, element)
-
-    def _tell(self, element, target):
-        for callback in element._impl.update_cb:
-            callback(SimpleNamespace(client=self.client, target=target))
 
     def drag(self, path, position=None, turn=None, *phases):
         """Move the handles of a node."""

@@ -12,11 +12,10 @@ from app.processes.messages.scene_messages import SceneChanged
 from app.services.event_hub import CurrentScene
 from app.services.goals import Draft, DraftChanged
 from app.viewer.job_panels import EPISODE_INTERVAL_S, EpisodePanel
-from app.viewer.nodes.episode_nodes import GOAL, PARTS, PLAY_S, REST_S, EpisodeNodes, cost_colours
+from app.viewer.nodes.episode_nodes import GOAL, PLAY_S, REST_S, EpisodeNodes, cost_colours
 from app.viewer.nodes.estimate_nodes import TRACKED
 from app.viewer.nodes.ghosts import FutureNodes, FutureStyle, along_way
 from app.viewer.nodes.room import AT
-from app.viewer.nodes.scene_nodes import SceneNodes
 from osfcore.control.events import ActionExecuted, Finished, GoalFound, Look, Looking, Stepped
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import goal_camera
@@ -135,7 +134,9 @@ def test_estimates_follow_without_words_and_doubted_objects_have_another_colour(
     assert not driver.shows(f"/episode/estimate/tried/{BOX}")
     assert not np.array_equal(box.batched_colors, can.batched_colors)
     assert driver.below(f"/episode/estimate/verdict/{BOX}") == set()
-    np.testing.assert_allclose(driver.node("/episode/estimate/light").position, AT * LIGHT.position, atol=1e-12)
+    light = driver.node(f"/episode/estimate/{TRACKED}/light")
+    assert not driver.shows("/episode/estimate/light")  # that of the search
+    np.testing.assert_allclose(light.position, AT * LIGHT.position, atol=1e-12)
 
 
 def test_ways_are_one_node_with_a_colour_for_each_and_the_best_one_is_another(drawing, driver):
@@ -162,29 +163,9 @@ def test_the_best_future_is_played_again_and_again_and_stands_at_its_end(drawing
         drawing.play(seconds)
         places.append(box.batched_positions[-1, 0])
     np.testing.assert_allclose(places, [0, 0.025, 0.05, 0.1, 0.1, 0.05], atol=1e-6)
-    drawing.show_part("plan", False)
-    drawing.play(0.0)
-    assert box.batched_positions[-1, 0] == pytest.approx(0.05)  # nobody sees it
     drawing.show_plan(None)
     drawing.play(0.0)
-    drawing.show_part("plan", True)
     assert not shows_plan(driver)
-
-
-def test_parts_can_be_hidden_also_before_they_are_drawn(drawing, driver):
-    for part in PARTS:
-        drawing.show_part(part, False)
-    drawing.show_goal(goal_at())
-    drawing.show_estimate(state(), ("", ""))
-    drawing.show_plan(sketch())
-    assert not any(driver.shows(f"/episode/{part}") for part in PARTS)
-    assert not driver.shows(f"/episode/goal/where/{BOX}")
-    assert not driver.shows(f"/episode/estimate/guess/{BOX}")
-    assert not shows_plan(driver)
-    assert not drawing.shows_light
-    drawing.show_part("estimate", True)
-    assert drawing.shows_light
-    assert [part for part in PARTS if driver.shows(f"/episode/{part}")] == ["estimate"]
 
 
 def test_everything_can_be_removed(drawing, driver):
@@ -193,7 +174,7 @@ def test_everything_can_be_removed(drawing, driver):
     drawing.show_estimate(state(), ("", ""))
     drawing.show_plan(sketch())
     drawing.clear()
-    assert not drawing.shows_light
+    assert driver.node("/episode/estimate/light") is driver.node(f"/episode/estimate/{TRACKED}/light") is None
     assert goals(driver) == {}
     assert guess(driver) is None
     assert guess(driver, of="goal/look") is None
@@ -285,9 +266,8 @@ class Room:
     def __init__(self, server, library):
         self.gui = ViewerDriver(server)
         self.rooms_made = 0
-        self.table = SceneNodes(server, library, lambda *_: None, lambda *_: None)
         self.drawing = EpisodeNodes(server, library)
-        self.panel = EpisodePanel(server, self.table, self.drawing, self.make_room)
+        self.panel = EpisodePanel(self.drawing, self.make_room)
 
     def make_room(self):
         self.rooms_made += 1
@@ -388,15 +368,10 @@ def test_when_it_is_done_the_goal_stays_and_the_plan_goes(room):
         Finished(12, "reached", "The table looks like the goal.", estimated().state),
     ):
         room.see(seen)
-    room.gui.press("Clear")
-    assert room.goal()  # it still runs
     room.hear(JobChanged(1, job("done")))
     assert room.goal() == set(NAMES)
     assert not room.shows_plan()
     assert room.estimate() is not None
-    room.gui.press("Clear")
-    until(lambda: room.panel.is_idle)
-    until(lambda: room.goal() == set())
 
 
 @pytest.mark.parametrize("after", ["failed", "interrupted", "cancelled"])
@@ -436,29 +411,12 @@ def test_a_goal_that_is_being_composed_replaces_that_of_a_former_episode(room):
     until(lambda: room.goal() == set())
 
 
-def test_the_green_cube_is_the_estimate_while_one_is_on_view(room):
-    assert room.gui.shows("/light")
-    room.see(stepped())
-    assert not room.gui.shows("/light")
-    room.gui.set("Show true light", True)
-    until(lambda: room.gui.shows("/light"))
-    assert room.gui.node("/light_name").text == "true light"
-    room.gui.set("Show true light", False)
-    room.gui.set("Show estimate", False)
-    until(lambda: room.gui.shows("/light"))
-    assert not room.gui.shows("/light_name")
-    room.gui.set("Show goal", False)
-    room.gui.set("Show plan", False)
-    assert not any(room.gui.shows(f"/episode/{part}") for part in PARTS)
-
-
 def test_another_scene_clears_the_view_and_coming_back_shows_a_running_episode_again(room):
     for seen in (found(), stepped(), sketch()):
         room.see(seen)
     assert room.rooms_made == 1
     room.hear(CurrentScene(record("other")))
     until(lambda: room.goal() == set())
-    assert room.gui.shows("/light")
     room.panel.show(JobView(job(), found(0.5)))  # goes on unseen
     room.hear(CurrentScene(record("s")))
     until(room.goal)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from app.jobs.job import Job, JobChanged, JobView
+from app.processes.messages.scene_messages import SceneChanged
 from app.services.event_hub import CurrentScene
 from app.viewer.job_panels import EstimatePanel
-from app.viewer.nodes.estimate_nodes import GHOSTS, EstimateNodes
-from app.viewer.nodes.room import AT, LINE, VIEW_AT, VIEW_FOV_RAD, VIEW_FROM, Label
-from app.viewer.nodes.scene_nodes import SceneNodes
+from app.viewer.nodes.estimate_nodes import GHOSTS, TRACKED, EstimateNodes
+from app.viewer.nodes.room import AT, LINE, VIEW_AT, VIEW_FOV_RAD, VIEW_FROM
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import Light
@@ -22,12 +22,11 @@ from tests.app.viewer.conftest import ViewerDriver
 BOX, UNKNOWN = "003_cracker_box", "055_baseball"  # the second has no mesh here
 LIGHT = Light(np.array([0.6, 0, 0.8]))
 UPRIGHT = np.array([1.0, 0, 0, 0])
-NAMES = {name: Label(name, np.array([0.1, -0.05, 0.25])) for name in (BOX, UNKNOWN)}
 
 
 @pytest.fixture
 def drawing(server, library):
-    return EstimateNodes(server, library, lambda: NAMES)
+    return EstimateNodes(server, library)
 
 
 def state(names=(BOX, UNKNOWN), z=0.1):
@@ -126,41 +125,28 @@ def test_doubted_objects_are_drawn_in_another_colour_with_the_reason(drawing, dr
     doubted, trusted = guess(driver).batched_colors, guess(driver, UNKNOWN).batched_colors
     assert not np.array_equal(doubted, trusted)
     texts = [node.text for node in verdicts(driver, "words")]
-    assert texts[0] == "DOUBTFUL: it is hardly visible"
-    assert texts[1].startswith("± 2 mm, ± 2.3")
+    assert texts[0] == "Cracker box: DOUBTFUL: it is hardly visible"
+    assert "± 2 mm, ± 2.3" in texts[1]
     assert driver.node("/estimate/light_name").text == "estimated light ± 1.1° (2σ)"
     drawing.show(state())  # another estimate begins: no verdict is left
     assert driver.below(f"/estimate/verdict/{BOX}") == set()
     np.testing.assert_array_equal(guess(driver).batched_colors, guess(driver, UNKNOWN).batched_colors)
 
 
-def test_words_cover_neither_names_nor_each_other(drawing, driver):
+def test_words_do_not_cover_each_other(drawing, driver):
     drawing.show(state(), estimate=judged())
     view = Camera.look_at("view", VIEW_FROM, VIEW_AT, fov_y_deg=float(np.rad2deg(VIEW_FOV_RAD)))
-    feet = [node.position for node in verdicts(driver, "words")] + [NAMES[BOX].anchor_m]
+    feet = [node.position for node in verdicts(driver, "words")]
     heights = np.sort(view.project(np.array(feet))[:, 1] / view.height)
     assert np.diff(heights).min() > 0.8 * LINE
 
 
-def test_what_is_not_on_the_table_is_named(server, driver, library):
-    drawing = EstimateNodes(server, library, lambda: {UNKNOWN: NAMES[UNKNOWN]})
-    drawing.show(state(), estimate=judged("it is hardly visible"))
-    texts = [node.text for node in verdicts(driver, "words")]
-    assert texts[0] == "Cracker box: DOUBTFUL: it is hardly visible"
-    assert texts[1].startswith("± 2 mm")
-
-
-def test_candidates_can_be_hidden_and_everything_removed(drawing, driver):
-    drawing.show_candidates(False)
+def test_everything_can_be_removed(drawing, driver):
     drawing.show(state(), tried(4), np.array([[0, 0, 1.0]]))
-    assert not driver.shows(f"/estimate/tried/{BOX}")
-    assert not driver.shows("/estimate/tried_lights")
-    assert not drawing.is_empty
     drawing.clear()
-    assert drawing.is_empty
+    assert not driver.shows("/estimate/tried_lights")
     assert driver.below("/estimate/guess") == driver.below("/estimate/tried") == set()
     assert driver.node("/estimate/light") is driver.node("/estimate/light_name") is None
-    drawing.show_candidates(True)
 
 
 def test_estimates_of_things_on_their_way_are_drawn_without_a_word(drawing, driver):
@@ -171,7 +157,8 @@ def test_estimates_of_things_on_their_way_are_drawn_without_a_word(drawing, driv
     assert driver.below(f"/estimate/verdict/{BOX}") == set()
     assert not driver.shows(f"/estimate/tried/{BOX}")
     assert not np.array_equal(before.batched_colors, guess(driver, UNKNOWN).batched_colors)
-    assert driver.node("/estimate/light_name").text == "estimated light"
+    assert driver.node(f"/estimate/{TRACKED}/light_name").text == "estimated light"
+    assert not driver.shows("/estimate/light")
 
 
 def test_another_drawing_has_its_own_nodes_and_colour_and_may_do_without_light(server, driver, library):
@@ -184,7 +171,7 @@ def test_another_drawing_has_its_own_nodes_and_colour_and_may_do_without_light(s
     drawing.show(state())
     assert tuple(driver.node(f"/elsewhere/guess/{BOX}").batched_colors) == (1, 2, 3)
     drawing.clear()
-    assert drawing.is_empty
+    assert driver.below("/elsewhere/guess") == set()
 
 
 def job(state="running", scene="s", name="a", **changes):
@@ -202,13 +189,16 @@ class Room:
 
     def __init__(self, server, library):
         self.gui = ViewerDriver(server)
-        self.table = SceneNodes(server, library, lambda *_: None, lambda *_: None)
         self.drawing = EstimateNodes(server, library)
-        self.panel = EstimatePanel(server, self.table, self.drawing)
+        self.panel = EstimatePanel(self.drawing)
 
     def see(self, of, what):
         self.panel.show(JobView(of, what))
         until(lambda: self.panel.is_idle)
+
+    @property
+    def is_empty(self):
+        return not self.gui.below("/estimate/guess") and self.gui.node("/estimate/light") is None
 
     def guess(self):
         node = self.gui.node(f"/estimate/guess/{BOX}")
@@ -227,54 +217,41 @@ def room(server, library):
 
 def test_steps_are_drawn(room):
     room.see(job(), step())
-    until(lambda: not room.drawing.is_empty)
+    until(lambda: not room.is_empty)
     room.see(job(), step(2, x=0.2))
     until(lambda: np.allclose(room.guess(), [[0.3, 0, 0.1]]))
 
 
-def test_what_an_estimate_has_drawn_is_cleared_once_it_is_over(room):
+def test_what_was_found_goes_once_somebody_moves_something(room):
     room.see(job(), step())
-    room.gui.press("Clear")
-    assert not room.drawing.is_empty  # it still runs
+    room.panel.show(SceneChanged(record("s")))
+    until(lambda: room.panel.is_idle)
+    assert not room.is_empty  # it still runs
     room.panel.show(JobChanged(1, job("done", result={"trusted": True})))
     until(lambda: room.panel.is_idle)
-    room.gui.press("Clear")
-    until(lambda: room.drawing.is_empty)
-
-
-def test_the_true_light_is_told_on_demand_only_and_is_back_when_the_estimate_is_gone(room):
-    assert room.gui.shows("/light")
-    room.see(job(), step())
-    until(lambda: not room.gui.shows("/light"))
-    room.gui.set("Show true light", True)
-    until(lambda: room.gui.shows("/light"))
-    assert room.gui.shows("/light_name")
-    assert room.gui.node("/light_name").text == "true light"
-    assert tuple(room.gui.node("/light").colors) != tuple(room.gui.node("/estimate/light").colors)
-    room.panel.show(JobChanged(1, job("cancelled")))
-    until(lambda: room.drawing.is_empty)
-    until(lambda: not room.gui.shows("/light_name"))
-    assert room.gui.shows("/light")
+    assert not room.is_empty
+    room.panel.show(SceneChanged(record("s")))
+    until(lambda: room.is_empty)
 
 
 def test_only_what_is_about_the_scene_on_view_is_drawn(room):
     room.see(job(scene="other"), step())
-    assert room.drawing.is_empty
+    assert room.is_empty
     room.see(job(scene=None, name="upload"), step())
-    until(lambda: not room.drawing.is_empty)
+    until(lambda: not room.is_empty)
     room.panel.show(JobChanged(1, job("done", scene=None, name="upload", result={"trusted": False})))
     until(lambda: room.panel.is_idle)
     room.see(job(), step())
-    assert not room.drawing.is_empty
+    assert not room.is_empty
     room.panel.show(CurrentScene(record()))
-    until(lambda: room.drawing.is_empty)
+    until(lambda: room.is_empty)
 
 
 def test_one_that_waits_does_not_take_the_view_from_one_that_runs(room):
     room.see(job(), step())
     room.panel.show(JobChanged(1, job("queued", name="b")))
     until(lambda: room.panel.is_idle)
-    assert not room.drawing.is_empty
+    assert not room.is_empty
 
 
 def test_a_former_one_that_is_renamed_does_not_take_the_view(room):
@@ -282,7 +259,7 @@ def test_a_former_one_that_is_renamed_does_not_take_the_view(room):
     room.panel.show(JobChanged(1, job("done", result={"trusted": True})))
     room.panel.show(JobChanged(2, job("done", name="b", result={"trusted": True})))
     until(lambda: room.panel.is_idle)
-    assert not room.drawing.is_empty
+    assert not room.is_empty
 
 
 def test_steps_of_jobs_of_other_kinds_are_not_drawn(room):
@@ -290,13 +267,13 @@ def test_steps_of_jobs_of_other_kinds_are_not_drawn(room):
     room.panel.show(JobView(other, step()))
     room.panel.show(JobChanged(1, other))
     assert room.panel.is_idle
-    assert room.drawing.is_empty
+    assert room.is_empty
 
 
 def test_of_one_that_failed_nothing_stays(room):
     room.see(job(), step())
     room.panel.show(JobChanged(1, job("failed", error="mask of x is empty.")))
-    until(lambda: room.drawing.is_empty)
+    until(lambda: room.is_empty)
 
 
 def test_a_defect_in_drawing_does_not_end_the_view(room, monkeypatch):

@@ -18,14 +18,11 @@ from app.episodes.trajectory import ReplayClock, read_trajectory
 from app.services.examples import Stories
 from app.viewer.page_views import PageViews, Replay, Wish
 from app.viewer.private_server import SECRET_HEADER
+from osfcore.geometry.cameras import Camera
 from tests.app.conftest import until
-from tests.app.viewer.conftest import BOX, uuid_of
+from tests.app.viewer.conftest import BOX, CAMERA
 
 STORY = "first"
-CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [1.0, 1.0, 1.0], "fov": 0.8, "near": 0.01,
-    "far": 10.0, "image_height": 100, "image_width": 100, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0],
-}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +56,12 @@ class Page:
 
     def send(self, frame):
         self._socket.send(frame)
+
+    def look(self, eye, at):
+        """Look from one place to another."""
+        view = Camera.look_at("view", eye, at).T_world_camera
+        seen = {"position": eye.tolist(), "look_at": at.tolist(), "wxyz": view.quaternion.tolist()}
+        self.send(msgspec.msgpack.encode({**CAMERA, **seen}))
 
     def told_about(self, path):
         """Kinds of messages about a node that have come since this was asked for last."""
@@ -123,6 +126,26 @@ def test_everything_is_where_it_was_after_a_step(live, course, step):
         ask(live, "page")
 
 
+def test_a_page_has_handles_only_if_it_wants_them(live, shown):
+    with opened(live, "one") as one, opened(live, "two") as two:
+        ask(live, "one")
+        ask(live, "two", handles=True)
+        until(lambda: one.hides("/handles") and two.own("/handles") is None)
+        ask(live, "one", handles=True)
+        until(lambda: one.own("/handles") is None)
+        ask(live, "two", handles=True, shows="beliefs")
+        until(lambda: two.hides("/handles") and two.hides("/objects") and two.hides("/light"))
+
+
+def test_what_stands_in_the_middle_of_a_view_is_named(live, shown):
+    at = np.array(shown["objects"][1]["position"])
+    with opened(live, "page") as page:
+        page.look(at + [0.0, -0.4, 0.4], at)
+        name = {"name": shown["objects"][1]["name"]}
+        until(lambda: live.request("GET", "/api/views/page/pointed?x=0.5&y=0.5") == (200, name))
+    assert live.request("GET", "/api/views/nobody/pointed?x=0.5&y=0.5") == (200, {"name": None})
+
+
 def test_it_plays_to_the_end_by_itself_faster_if_wanted(live, course):
     end_s = ReplayClock(course).length_s
     with opened(live, "page") as page:
@@ -164,23 +187,22 @@ def test_what_plays_goes_on_when_something_else_of_it_is_looked_at(live, course)
         ask(live, "page")
 
 
-def test_a_page_that_only_watches_moves_its_camera_and_nothing_else(live):
-    button = live.services.viewer.server.gui.add_checkbox("Test", False)
-    driver = live.services.driver
-    press = msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": uuid_of(button), "updates": {"value": True}})
+def test_a_page_that_only_watches_moves_its_camera_and_nothing_else(live, browser, shown):
+    driver, body = live.services.driver, until(lambda: browser.node(f"/objects/{BOX}"))
+    turn = {"type": "TransformControlsUpdateMessage", "name": f"/handles/{BOX}", "wxyz": [1.0, 0, 0, 0], "owner": ""}
+    lift = msgspec.msgpack.encode({**turn, "position": [0.0, 0.0, 0.7]})
     try:
         driver.arrive("drives")
         with opened(live, "watches") as page:
-            page.send(press)
+            page.send(lift)
             page.send(msgspec.msgpack.encode(CAMERA | {"position": [2.0, 2.0, 2.0]}))
             until(lambda: np.allclose(page.camera.position, 2.0))
-            assert not button.value
+            assert body.position[2] < 0.5
             driver.take("watches")
-            page.send(press)
-            until(lambda: button.value)
+            page.send(lift)
+            until(lambda: np.isclose(body.position[2], 0.7))
     finally:
         driver.leave("drives")
-        button.remove()
 
 
 @pytest.mark.parametrize("handles", [f"/handles/{BOX}", f"/goal/objects/{BOX}"])

@@ -1,4 +1,4 @@
-"""The table in the 3D view: what is drawn where, what hands move, its light, names and shadows."""
+"""The table in the 3D view: what is drawn where, what hands move, its light and shadows."""
 
 from dataclasses import replace
 
@@ -9,18 +9,22 @@ from hypothesis import strategies as st
 
 from app.viewer.nodes.room import AT, CHARACTER, LINE, VIEW_AT, VIEW_FOV_RAD, VIEW_FROM, framing, separated
 from app.viewer.nodes.scene_nodes import (
+    LAMP_NAME,
+    PUSHER_NAME,
     SceneNodes,
     clipped,
     dome_point,
     level_point,
     light_toward,
+    pointed_at,
     shadow_colour,
     shadow_mesh,
 )
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, MIN_LIGHT_ELEVATION_DEG, Light
-from osfcore.geometry.poses import quaternion_multiply
+from osfcore.geometry.poses import Pose, quaternion_multiply
+from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.world.imaging import TABLE_ALBEDO
 from tests.app.conftest import until
@@ -126,38 +130,6 @@ def table(server, library):
     return SceneNodes(server, library, lambda *_: None, lambda *_: None)
 
 
-def test_the_lamp_can_be_hidden_or_named_and_still_follows(table, driver):
-    table.show(record().state)
-    own = tuple(driver.node("/light").colors)
-    table.show_lamp(is_on=False)
-    assert not any(driver.shows(path) for path in ("/light", "/light_ray", BALL))
-    light = Light(np.array([0.0, -0.6, 0.8]))
-    table.place(replace(record().state, light=light))
-    np.testing.assert_allclose(driver.node("/light").position, AT * light.position, atol=1e-12)
-    table.show_lamp(is_on=True, name="true light")
-    assert driver.shows("/light")
-    assert driver.shows("/light_ray")
-    assert tuple(driver.node("/light").colors) != own
-    assert driver.node("/light_name").text == "true light"
-    np.testing.assert_allclose(driver.node("/light_name").position, AT * light.position, atol=1e-12)
-    table.show_lamp(is_on=True)
-    assert tuple(driver.node("/light").colors) == own
-    assert not driver.shows("/light_name")
-
-
-def test_the_lamp_is_as_usual_once_no_view_wants_it_otherwise(table, driver):
-    table.show_lamp(is_on=False, name="true light", by="one")
-    table.show_lamp(is_on=True, by="two")
-    assert not driver.shows("/light")
-    table.show_lamp(is_on=True, name="true light", by="two")
-    assert driver.shows("/light")
-    assert driver.node("/light_name").text == "true light"
-    table.show_lamp(is_on=True, by="two")
-    table.show_lamp(is_on=True, by="one")
-    assert driver.shows("/light")
-    assert not driver.shows("/light_name")
-
-
 CUBE = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (0, 2)], float) * 0.05
 HALF_M = TABLE_SIDE_M / 2
 
@@ -228,6 +200,22 @@ def test_a_hand_that_points_at_a_level_meets_it_there_and_the_sky_nowhere():
     assert level_point(eye, eye + 0.3 * (point - eye), 0.05) == pytest.approx(point)
     assert level_point(eye, eye + [0.0, 1.0, 0.1], 0.05) is None
     assert level_point(eye, np.array([0.0, 3.0, 0.5]), 0.0) is None  # beyond the table
+
+
+def test_a_ray_meets_what_is_nearest(library):
+    poses = Pose(np.array([[0.0, 0.0, 0.1], [0.0, 0.3, 0.1]]), np.tile([1.0, 0, 0, 0], (2, 1)))
+    scene = SceneState((BOX, BOTTLE), poses, Light(np.array([0.8, 0.0, 0.6])), np.array([0.0, -0.3, 0.06]))
+    eye = np.array([0.0, -2.0, 0.1])
+
+    def meets(*to):
+        return pointed_at(scene, library, eye, np.array(to) - eye)
+
+    assert meets(0.0, 0.3, 0.1) == PUSHER_NAME  # before both objects
+    assert meets(0.0, 0.0, 0.18) == BOX  # over the pusher, at its top
+    assert meets(0.8 * AT, 0.0, 0.6 * AT) == LAMP_NAME
+    assert meets(0.3, 0.0, 0.1) is None
+    assert pointed_at(scene, library, eye, np.array([0.0, -1.0, 0.0])) is None  # all is behind
+    assert pointed_at(scene, library, np.array([0.0, 2.0, 0.1]), np.array([0.0, -1.0, 0.0])) == BOTTLE
 
 
 on_dome = st.builds(Light.from_angles, st.floats(-np.pi, np.pi), st.floats(0.0873, 1.57)).map(

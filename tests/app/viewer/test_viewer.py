@@ -27,16 +27,7 @@ def test_a_dropped_object_falls_and_one_in_another_goes_back(live, browser, show
         assert put_back["quaternion"] == pytest.approx(lying["quaternion"], abs=1e-3)
 
 
-def test_handles_show_only_when_wanted(live, browser, shown):
-    assert not any(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE))
-    browser.set("Handles", True)
-    until(lambda: all(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
-    browser.set("Handles", False)
-    until(lambda: not any(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
-
-
 def test_a_goal_is_composed_with_copies_of_its_own(live, browser, shown):
-    browser.set("Handles", True)
     until(lambda: all(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
     live.request("POST", "/api/goals/draft", {"scene": None})
     until(lambda: browser.below("/goal/objects") == {BOX, BOTTLE})
@@ -50,7 +41,6 @@ def test_a_goal_is_composed_with_copies_of_its_own(live, browser, shown):
     live.request("DELETE", "/api/goals/draft")
     until(lambda: browser.below("/goal/objects") == set())
     until(lambda: all(browser.shows(f"/handles/{name}") for name in (BOX, BOTTLE)))
-    browser.set("Handles", False)
 
 
 def test_an_episode_on_the_table_is_drawn_in_place_of_an_estimate(live, browser, shown):
@@ -58,15 +48,11 @@ def test_an_episode_on_the_table_is_drawn_in_place_of_an_estimate(live, browser,
     mine = job(scene=shown["id"])
     for seen in (found(), sketch(), stepped()):
         hub.publish(JobView(mine, seen))
-    until(lambda: browser.shows("/episode/plan/ways") and browser.shows("/episode/estimate/light"))
-    until(lambda: not browser.shows("/light"))
+    until(lambda: browser.shows("/episode/plan/ways") and browser.shows("/episode/estimate/tracked/light"))
     assert browser.below("/estimate/guess") == set()
-    # Another panel that draws guesses has its say, and nothing against it.
-    browser.set("Show true light", False, folder="Estimate")
-    assert not browser.shows("/light")
     hub.publish(JobChanged(1, job("done", scene=shown["id"])))
     live.request("POST", f"/api/scenes/{shown['id']}/reset")
-    until(lambda: browser.shows("/light"))
+    until(lambda: browser.node("/episode/estimate/tracked/light") is None)
 
 
 def test_nobody_can_open_a_tunnel(live):

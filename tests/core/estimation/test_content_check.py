@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from osfcore.estimation.camera_response import srgb_of_linear
-from osfcore.estimation.content_check import ContentChecker, is_goal_view
+from osfcore.estimation.content_check import ContentChecker
+from osfcore.estimation.goal_view import is_goal_view
 from osfcore.estimation.objective import ObjectModels
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import goal_camera

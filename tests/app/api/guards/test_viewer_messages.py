@@ -5,11 +5,8 @@ from hypothesis import strategies as st
 
 from app.api.guards.token_gate import RateLimit
 from app.api.guards.viewer_messages import MAX_FRAME_BYTES, allowed_kind
+from tests.app.viewer.conftest import CAMERA
 
-CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1.0, 0, 0, 0], "position": [0.0, 1, 2], "fov": 0.8, "near": 0.1, "far": 100,
-    "image_height": 480, "image_width": 640, "look_at": [0.0, 0, 0], "up_direction": [0.0, 0, 1],
-}  # fmt: skip
 HANDLE = {"type": "TransformControlsUpdateMessage", "name": "/a", "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 1]}
 
 
@@ -17,15 +14,9 @@ def encoded(message):
     return msgspec.msgpack.encode(message)
 
 
-def pressed(**updates):
-    return {"type": "GuiUpdateMessage", "uuid": "a", "updates": updates}
-
-
 @pytest.mark.parametrize(
-    "message",
-    [CAMERA, HANDLE, pressed(value=True), pressed(value=0.5), pressed(value="+x"),
-     {"type": "TransformControlsDragEndMessage", "name": "/a", "owner": ""}],
-)  # fmt: skip
+    "message", [CAMERA, HANDLE, {"type": "TransformControlsDragEndMessage", "name": "/a", "owner": ""}]
+)
 def test_what_the_page_sends_is_allowed(message):
     assert allowed_kind(encoded(message)) == message["type"]
 
@@ -33,12 +24,9 @@ def test_what_the_page_sends_is_allowed(message):
 @pytest.mark.parametrize(
     "message",
     [
-        pressed(update_cb=[]),
-        pressed(value=True, disabled=True),
-        pressed(value="x" * 10_000),
-        pressed(value=["x"] * 100),
-        pressed(value=float("nan")),
-        pressed(),
+        {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": True}},
+        HANDLE | {"position": ["x"] * 3},
+        HANDLE | {"position": [0.0] * 100},
         HANDLE | {"position": [float("inf"), 0, 0]},
         HANDLE | {"scale": 3},
         HANDLE | {"name": "x" * 1000},
