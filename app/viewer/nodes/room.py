@@ -18,6 +18,7 @@ from osfcore.world.imaging import TABLE_ALBEDO
 # `framing` looks from the same direction.
 VIEW_FROM, VIEW_AT, VIEW_FOV_RAD = (0.0, -1.31, 0.97), (0.0, 0.02, 0.0), 0.7
 TABLE_THICKNESS_M = 0.04
+_BOUNCE = 0.4  # share of light that reaches what faces down; walls get half of it
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 NO_LINES = np.zeros((1, 2, 3), np.float32)  # viser has no node of no lines
 GAMMA = 2.2  # of viser's colours
@@ -39,6 +40,11 @@ def add_room(server: viser.ViserServer) -> None:
     camera.near, camera.far = 0.01, 20.0
     # three.js divides by pi what Lambert's law does not
     scene.add_light_ambient("/ambient", intensity=float(np.pi * AMBIENT))
+    # What the table throws back softens the sides and undersides of things; what faces up, and so the table and the
+    # shadows on it, has none of it.
+    scene.add_light_hemisphere(
+        "/bounce", intensity=float(np.pi * _BOUNCE), sky_color=(0, 0, 0), position=(0.0, 0.0, 1.0)
+    )
     scene.add_box(
         "/table",
         color=colour_of(TABLE_ALBEDO),

@@ -20,6 +20,7 @@ from app.viewer.nodes.scene_nodes import (
     shadow_colour,
     shadow_mesh,
 )
+from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose, quaternion_multiply
@@ -98,6 +99,17 @@ def test_a_dragged_light_lights_the_scene_when_let_go(live, browser, shown):
     browser.drag_body(BALL, ABOVE, before, after, "end")
     until(lambda: np.allclose(live.request("GET", f"/api/scenes/{shown['id']}")[1]["light"]["position"], [0, 0.6, 0.8]))
     until(lambda: np.allclose(browser.node("/lamp").position, [0, 0.6, 0.8]))  # older changes may be drawn before
+
+
+def test_a_light_that_may_not_be_moved_goes_back(live, browser, shown, monkeypatch):
+    def refuse(*_, **__):
+        raise OsfError("A job uses the table.")
+
+    until(lambda: browser.table_agrees(shown))
+    monkeypatch.setattr(live.services.runner.scenes, "edit", refuse)
+    light = shown["light"]["position"]
+    browser.drag_body(BALL, ABOVE, AT * np.array(light), AT * np.array([0, 0.6, 0.8]))
+    until(lambda: np.allclose(browser.node("/lamp").position, light))
 
 
 def test_a_light_that_somebody_holds_goes_back_when_another_takes_over(live, browser, shown):
