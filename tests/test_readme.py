@@ -24,7 +24,14 @@ GUIDES = [
     ROOT / "README.md",
     *(
         ROOT / "docs" / f"{name}.md"
-        for name in ("command-line", "exchange", "rest", "own-objects", "evaluation", "photos")
+        for name in (
+            "reference/command-line",
+            "reference/exchange",
+            "reference/rest",
+            "how-to/own-objects",
+            "explanation/evaluation",
+            "how-to/photos",
+        )
     ),
 ]
 OSF = Path(sys.executable).with_name("osf")
@@ -141,7 +148,7 @@ def test_an_observation_is_sent_as_written(data_dir, tmp_path, seen):
     assert [estimate["id"] for estimate in listed["estimates"]] == [sent["id"]]
 
 
-@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")], ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
     for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
         assert (page.parent / link).exists(), link
