@@ -28,14 +28,15 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 
 default_role = "literal"  # of single backticks in docstrings
+autoclass_content = "both"  # the class and its constructor
 autodoc_default_options = {"members": True, "member-order": "bysource", "exclude-members": "model_config"}
 autodoc_typehints_format = "short"
 autosummary_generate = False
-napoleon_use_ivar = True
-napoleon_attr_annotations = False  # signatures have the types
+napoleon_custom_sections = [("Attributes", "params_style")]  # of dataclasses, what their constructors take
 python_maximum_signature_line_length = 90
 
 html_theme = "furo"
+pygments_dark_style = "github-dark"
 html_title = project
 html_favicon = html_logo = "../static/icon.svg"
 html_static_path = ["site.css", str(MATHJAX)]
