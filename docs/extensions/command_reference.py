@@ -36,7 +36,7 @@ def sections() -> Iterator[str]:
 def fill(_app: Sphinx, page: str, source: list[str]) -> None:
     """Append the sections to their page when it is read."""
     if page == PAGE:
-        os.environ["COLUMNS"] = "86"  # what fits beside the site's menu
+        os.environ["COLUMNS"] = "80"  # what fits beside the site's menu
         source[0] = "\n\n".join([source[0], *sections()])
 
 
