@@ -37,6 +37,7 @@ def fill(_app: Sphinx, page: str, source: list[str]) -> None:
     """Append the sections to their page when it is read."""
     if page == PAGE:
         os.environ["COLUMNS"] = "80"  # what fits beside the site's menu
+        os.environ.pop("OSF_DATA_DIR", None)  # the default is shown, and not this machine's choice
         source[0] = "\n\n".join([source[0], *sections()])
 
 
