@@ -1,5 +1,6 @@
 # make demo   build everything and open the page      make test   the quick tests (minutes)
 # make test-all   every test, browser included      make coverage   lines that the quick tests reach
+# make docs   the site of documents, in build/docs
 # make test-pythons   that the library installs and runs on later Pythons, where there is no simulator
 # Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   OSF_DATA_DIR=<where objects and runs live>
 
@@ -14,7 +15,7 @@ OFFLINE := echo "make: the packages could not be installed; see the lines above 
 
 LATER := 3.12 3.13
 
-.PHONY: demo install dev test test-all test-pythons coverage lint soak bench clean
+.PHONY: demo install dev test test-all test-pythons coverage lint docs soak bench clean
 
 demo: install
 	@$(BIN)/osf assets fetch
@@ -67,6 +68,11 @@ lint: dev
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
 
+# From the beginning each time: pages are made from code, which Sphinx does not watch.
+docs: dev
+	$(BIN)/sphinx-build --fresh-env --quiet --fail-on-warning --keep-going docs build/docs
+	@echo "The site begins at build/docs/index.html"
+
 # Half an hour: ten thousand malformed requests, a hundred kills, full disks, a quarter of an hour of episodes.
 # OSF_SOAK_HOURS=8 makes a night of it.
 soak: dev
@@ -79,4 +85,4 @@ bench: dev
 	$(BIN)/python -m tests.bench.bench_page
 
 clean:
-	rm -rf $(VENV) .cache .pytest_cache .ruff_cache .hypothesis test-artifacts
+	rm -rf $(VENV) build .cache .pytest_cache .ruff_cache .hypothesis test-artifacts

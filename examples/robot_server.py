@@ -1,4 +1,4 @@
-"""A robot that speaks HTTP as docs/robots.md says; its table is simulated. Needs the extra `serve`, and meshes."""
+"""A robot as docs/how-to/robots.md describes it; its table is simulated. Needs the extra `serve`, and meshes."""
 
 import sys
 import threading

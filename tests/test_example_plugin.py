@@ -27,7 +27,7 @@ from osfcore.world.tabletop import WORLD, WORLDS, Tabletop
 from tests.support.errors import about
 
 ROOT = Path(__file__).parents[1]
-SOURCE, GUIDE = ROOT / "examples" / "plugin", ROOT / "docs" / "extending.md"
+SOURCE, GUIDE = ROOT / "examples" / "plugin", ROOT / "docs" / "how-to" / "extending.md"
 NAME = "009_gelatin_box"
 
 

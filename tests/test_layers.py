@@ -1,4 +1,4 @@
-"""The import rules of docs/architecture.md, checked on the source text."""
+"""The import rules of docs/explanation/architecture.md, checked on the source text."""
 
 import ast
 import importlib

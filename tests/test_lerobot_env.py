@@ -177,7 +177,8 @@ def test_lerobot_makes_it_and_it_observes_what_data_sets_tell(lerobot, run, data
 def test_the_commands_of_the_docs_train_and_evaluate(run, data_dir, tmp_path):
     """With less of everything."""
     recorded(tmp_path / "demonstrations", images=False)
-    (block,) = re.findall(r"```sh\n(lerobot-.*?)```", (ROOT / "docs" / "extending.md").read_text(), flags=re.DOTALL)
+    guide = (ROOT / "docs" / "how-to" / "extending.md").read_text()
+    (block,) = re.findall(r"```sh\n(lerobot-.*?)```", guide, flags=re.DOTALL)
     train, evaluate = (shlex.split(line) for line in block.splitlines())
     small = ["dim_model=32", "n_heads=2", "dim_feedforward=32", "chunk_size=2", "n_action_steps=2", "use_vae=false"]
     run(*train, "--steps=2", "--batch_size=2", "--num_workers=0", *(f"--policy.{one}" for one in small))

@@ -8,12 +8,16 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+import yaml
 
+import osfcore
 from osfcore.fields.kiloosf import read_field
 from osfcore.world.collect_images import CollectObservation, collect_observation
 from tests.live import live_service
@@ -24,9 +28,17 @@ GUIDES = [
     ROOT / "README.md",
     *(
         ROOT / "docs" / f"{name}.md"
-        for name in ("command-line", "exchange", "rest", "own-objects", "evaluation", "photos")
+        for name in (
+            "reference/command-line",
+            "reference/exchange",
+            "reference/rest",
+            "how-to/own-objects",
+            "explanation/evaluation",
+            "how-to/photos",
+        )
     ),
 ]
+REFERENCE = sorted((ROOT / "docs" / "reference" / "python").glob("*.md"))
 OSF = Path(sys.executable).with_name("osf")
 
 
@@ -141,7 +153,32 @@ def test_an_observation_is_sent_as_written(data_dir, tmp_path, seen):
     assert [estimate["id"] for estimate in listed["estimates"]] == [sent["id"]]
 
 
-@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")], ids=lambda page: page.name)
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in REFERENCE if page.stem != "index"], ids=lambda page: page.stem)
+def test_examples_of_the_python_reference_run(page, data_dir, tmp_path):
+    (program,) = re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    environment = {**os.environ, "OSF_DATA_DIR": str(data_dir)}
+    with live_service(data_dir) if page.stem == "client" else nullcontext("") as url:
+        command = [sys.executable, "-c", program.replace("http://127.0.0.1:8000", url)]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-500:]
+    assert done.stdout
+
+
+def test_the_python_reference_has_every_public_name():
+    text = "".join(page.read_text() for page in REFERENCE)
+    assert set(osfcore.__all__) <= set(re.findall(r"\.\. auto\w+:: (?:osfcore\.)?(\w+)\n", text))
+    (lists,) = (page.read_text() for page in REFERENCE if page.stem == "index")
+    assert set(osfcore.__all__) == set(re.findall(r"^   (\w+)$", lists, flags=re.MULTILINE))
+
+
+def test_the_citation_is_of_this_version_and_of_the_paper():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert cited["version"] == version("osf-manipulation")
+    assert cited["preferred-citation"]["url"] in README
+
+
+@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")], ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
     for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
         assert (page.parent / link).exists(), link

@@ -139,7 +139,7 @@ class EpisodeStep(Entry):
     seconds: dict[str, float]
 
 
-class _Running(Entry):
+class Running(Entry):
     """Work of the service as it is now.
 
     Attributes:
@@ -168,7 +168,7 @@ class _Running(Entry):
         return self.status not in ("queued", "running", "paused")
 
 
-class Episode(_Running):
+class Episode(Running):
     """An episode as it is now.
 
     Attributes:
@@ -188,7 +188,7 @@ class Episode(_Running):
     files: list[str]
 
 
-class Estimate(_Running):
+class Estimate(Running):
     """An estimate of poses and light as it is now.
 
     Attributes:

@@ -185,6 +185,9 @@ class EpisodeSettings:
         reached_m: objects this close to their goals have arrived [m].
         reached_rad: likewise for orientations [rad].
         renewed: count steps anew after disturbances; off where the number of actions is what is measured.
+
+    Raises:
+        InvalidInput: naming what is out of range.
     """
 
     steps: int = 100
@@ -199,11 +202,7 @@ class EpisodeSettings:
     renewed: bool = True
 
     def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            InvalidInput: naming what is out of range.
-        """
+        """Check the ranges."""
         check_ranges(
             ("number of steps", self.steps, 1, MAX_STEPS),
             ("actions of each plan", self.replan_every, 1, MAX_STEPS),

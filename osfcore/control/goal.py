@@ -28,17 +28,16 @@ class GoalImage:
     Attributes:
         camera: that took it.
         image: linear RGB in [0, 1].
+
+    Raises:
+        InvalidInput: if the image has another size than the camera's, or is not finite.
     """
 
     camera: Camera
     image: Float[np.ndarray, "h w 3"]
 
     def __post_init__(self) -> None:
-        """Check that the camera fits.
-
-        Raises:
-            InvalidInput: if the image has another size than the camera's, or is not finite.
-        """
+        """Check that the camera fits."""
         size = (self.camera.height, self.camera.width, 3)
         if self.image.shape != size:
             raise InvalidInput("shape of the goal image", self.image.shape, f"{size}, as its camera tells")

@@ -236,7 +236,12 @@ FieldT = TypeVar("FieldT", bound=DensityGrid)
 
 
 class ObjectModels:
-    """Fields of the objects, and two renderers of them: alone over black, and together on the table."""
+    """Fields of the objects, and two renderers of them.
+
+    Attributes:
+        alone: draws objects over black.
+        together: draws them on the table.
+    """
 
     def __init__(
         self,
@@ -289,7 +294,7 @@ class ObjectModels:
 
     @property
     def can_change(self) -> bool:
-        """True if `changed` works: not where another renderer draws fields of its own kind."""
+        """Whether `changed` works, which it does not where another renderer draws fields of its own kind."""
         return self._changeable is not None
 
     def changed(

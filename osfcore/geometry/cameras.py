@@ -38,6 +38,9 @@ class Camera:
         intrinsics: focal lengths and principal point, 3 x 3 [px].
         width: of the image [px].
         height: of the image [px].
+
+    Raises:
+        InvalidInput: if a side is outside 16 to 1024 px, or the intrinsics are no such matrix.
     """
 
     name: str
@@ -119,10 +122,24 @@ class Camera:
 
 
 def default_cameras(size: int = DEFAULT_IMAGE_SIDE) -> tuple[Camera, ...]:
-    """Return the cameras "0" to "3" around the table."""
+    """Return the cameras "0" to "3" around the table.
+
+    Args:
+        size: sides of the images [px].
+
+    Raises:
+        InvalidInput: if it is outside 16 to 1024.
+    """
     return tuple(Camera.look_at(str(i), p, SCENE_CENTRE, size=size) for i, p in enumerate(CAMERA_POSITIONS))
 
 
 def goal_camera(size: int = DEFAULT_IMAGE_SIDE) -> Camera:
-    """Return the camera "goal", from which goal images are taken."""
+    """Return the camera "goal", from which goal images are taken.
+
+    Args:
+        size: sides of the image [px].
+
+    Raises:
+        InvalidInput: if it is outside 16 to 1024.
+    """
     return Camera.look_at("goal", GOAL_CAMERA_POSITION, SCENE_CENTRE, size=size)

@@ -20,6 +20,9 @@ class Light:
 
     Attributes:
         position: 1 m from the table's centre, toward the light [m]; other lengths are brought to 1 m.
+
+    Raises:
+        InvalidInput: if it is zero, not finite, or less than 5 degrees above the table.
     """
 
     position: Float[np.ndarray, "3"]

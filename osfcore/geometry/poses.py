@@ -86,7 +86,12 @@ def quaternion_log(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batc
 def rotation_angle(
     a: Float[np.ndarray, "*#batch 4"], b: Float[np.ndarray, "*#batch 4"]
 ) -> Float[np.ndarray | np.float64, "*out"]:
-    """Angle of the rotation between two orientations [rad], in [0, pi]; q and -q are the same orientation."""
+    """Angle of the rotation between two orientations [rad], in [0, pi]; q and -q are the same orientation.
+
+    Args:
+        a: unit quaternions (w, x, y, z).
+        b: likewise; batches broadcast.
+    """
     difference = quaternion_multiply(quaternion_conjugate(a), b)
     return 2.0 * np.arctan2(np.linalg.norm(difference[..., 1:], axis=-1), np.abs(difference[..., 0]))
 

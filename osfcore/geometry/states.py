@@ -29,6 +29,9 @@ class SceneState:
         poses: `T_world_object`, a batch of N.
         light: the one light.
         pusher: centre of the pusher [m], or None where there is none (goal images).
+
+    Raises:
+        InvalidInput: if there are too many objects, one comes twice, or a number is not finite or of another shape.
     """
 
     names: tuple[str, ...]

@@ -13,7 +13,7 @@ from osfcore.io.files import write_atomically
 
 
 def to_uint8(image: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Return values in [0, 1] as 8 bit."""
+    """Return values in [0, 1] as 8 bit, 0 to 255; what lies outside is cut."""
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 

@@ -177,7 +177,7 @@ def cameras_of(entries: Iterable[CameraJson]) -> tuple[Camera, ...]:
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """Return one camera as plain lists and numbers."""
+    """Return one camera as scene.json holds it: "name", "T_world_camera" 4 x 4, "K" 3 x 3 [px], "width", "height"."""
     return encode(CameraJson.of(camera))
 
 

@@ -1,1 +1,4 @@
-"""The method as published, module by module; docs/paper.md lists the choices and deviations, each module its own."""
+"""The method as published, module by module.
+
+docs/explanation/paper.md lists the choices and deviations, each module its own.
+"""

@@ -133,7 +133,9 @@ class PoseGoal:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseCost:
-    """S = mean_t c(t) + 2 c(T) with c(t) = sum_n |p_n(t) - p_n*| + arm * angle(q_n(t), q_n*), p horizontally [m].
+    """Distance of poses: `S = mean_t c(t) + 2 c(T)`, `c(t) = sum_n |p_n(t) - p_n*| + arm * angle(q_n(t), q_n*)` [m].
+
+    Positions p are compared horizontally.
 
     Attributes:
         goal: where that is.

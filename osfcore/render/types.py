@@ -57,6 +57,9 @@ class SceneBatch:
         lights: unit vectors toward the distant light; they play no part where there are near lamps.
         pusher: its centre [m]; None where there is none.
         spots: the near lamp of each scene, in the place of its distant light; None for distant lights.
+
+    Raises:
+        InvalidInput: if an array has another shape, is not finite or not of unit length, or there are too many objects.
     """
 
     names: tuple[str, ...]

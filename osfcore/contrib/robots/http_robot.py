@@ -1,4 +1,4 @@
-"""A robot that speaks HTTP: JSON and picture files, as docs/robots.md describes."""
+"""A robot that speaks HTTP: JSON and picture files, as docs/how-to/robots.md describes."""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ def repository_weights(name: str, own: str) -> Path:
     if not path.exists():
         raise OsfError(
             f"The weights of this rival are not part of the installed package; take {name} out of the repository's "
-            f"osfcore/experiments/rivals/shipped and put it at {own}, or train it as docs/evaluation.md says."
+            f"osfcore/experiments/rivals/shipped and put it at {own}, or train it as "
+            "docs/explanation/evaluation.md says."
         )
     return path

@@ -21,7 +21,7 @@ from tests.live import free_port
 from tests.support.robots import NAMES, example, know_truth, serving, simulated, toward_middle, until
 from tests.support.ros_robots import StandIn
 
-GUIDE = Path(__file__).parents[3] / "docs" / "robots.md"
+GUIDE = Path(__file__).parents[3] / "docs" / "how-to" / "robots.md"
 SMALL = ("--samples", "16", "--horizon", "6", "--steps", "2")
 
 

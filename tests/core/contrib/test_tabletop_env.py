@@ -141,7 +141,7 @@ def test_environments_side_by_side_are_those_one_by_one(data_dir, made, mode):
 
 @pytest.mark.slow
 def test_the_program_of_the_docs_runs(data_dir, tmp_path):
-    guide = (Path(__file__).parents[3] / "docs" / "extending.md").read_text()
+    guide = (Path(__file__).parents[3] / "docs" / "how-to" / "extending.md").read_text()
     (program,) = re.findall(r"```python\n(.*?)```", guide, flags=re.DOTALL)
     environment = {**os.environ, "OSF_DATA_DIR": str(data_dir)}
     command = [sys.executable, "-c", program]
