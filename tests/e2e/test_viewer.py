@@ -94,7 +94,7 @@ def settled(view, is_there):
 def has_bottle(pictures):
     """Whether much is yellow; a little of the box is."""
     red, green, blue = np.moveaxis(pictures, -1, 0)
-    return ((green > 0.75 * red) & (red > 90) & (blue < 0.5 * red)).sum(1) > FEW
+    return ((green > 0.85 * red) & (red > 90) & (blue < 0.5 * red)).sum(1) > FEW
 
 
 def has_box(pictures):
@@ -147,10 +147,10 @@ def drag(view, *spots):
     view.mouse.up()
 
 
-def is_green(view, spot):
+def is_yellow(view, spot):
     column, row = np.round(spot).astype(int)
     red, green, blue = np.asarray(Image.open(io.BytesIO(view.screenshot())).convert("RGB"), int)[row, column]
-    return green > 1.5 * max(red, blue)
+    return min(red, green) > 1.5 * blue
 
 
 def test_the_lamp_and_the_copies_of_a_goal_are_dragged(service, view, library):
@@ -166,7 +166,7 @@ def test_the_lamp_and_the_copies_of_a_goal_are_dragged(service, view, library):
     def copy():
         return np.array(call(service, "GET", "goals/draft")["objects"][0]["position"])
 
-    until(lambda: is_green(view, seen(lamp())), DRAW_S)  # the camera stands where this table fills the view
+    until(lambda: is_yellow(view, seen(lamp())), DRAW_S)  # the camera stands where this table fills the view
     spot = np.array([300.0, 150.0])
     drag(view, seen(lamp()), spot)
     until(lambda: np.linalg.norm(seen(lamp()) - spot) < near_px)
