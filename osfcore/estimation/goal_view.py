@@ -12,8 +12,8 @@ from osfcore.geometry.cameras import Camera
 _SIDE = 128  # of the picture that is looked at [px]
 _PLAIN = 0.01  # standard deviation of the radiance, below which a picture is one plain colour
 # Of the border of 24 goal images with one to eight objects, and of these as JPEGs, turned, dimmed, cropped or noisy, at
-# most 33 % lay beside the table's colour; of four real photographs of tables 60 % or more, and 50 % of the sample photo,
-# whose wood has nearly the table's hue.
+# most 33 % lay beside the table's colour; of four real photographs of tables 60 % or more, of the sample photo,
+# whose wood has nearly the table's hue, 50 %.
 _BORDER, _MOST_BESIDE = 1 / 12, 0.42  # of the picture's side; of the border
 _BESIDE_TABLE = 0.03  # error of a pixel that the table does not explain [radiance]
 _SHADED, _LIT = 0.2, 1.05  # light on the table, as a share of that under a lamp overhead
