@@ -144,7 +144,7 @@ class EstimateNodes:
                 nodes.place(state.poses[n], is_tracked=True)
                 nodes.tried.visible = False
                 nodes.paint(_DOUBTED if doubts[n] else _SURE)
-            self._show_light(state.light, "estimated light", is_tracked=True)
+            self._show_light(state.light, is_tracked=True)
 
     def clear(self) -> None:
         """Remove everything."""
@@ -179,7 +179,7 @@ class EstimateNodes:
         return add_ghosts(self._scene, f"{self._root}/{path}", mesh, GHOSTS, colour, opacity)
 
     def _show_light(
-        self, light: Light, text: str, tried: np.ndarray | None = None, *, is_tracked: bool = False
+        self, light: Light, text: str = "", tried: np.ndarray | None = None, *, is_tracked: bool = False
     ) -> None:
         if not self._has_light:
             return
