@@ -204,7 +204,7 @@ def going_on(former: Motion, motion: Motion) -> Motion:
     """Return the scenes with velocities by how things moved since the former ones, one action ago.
 
     The mean over the action stands for its last substep. (To predict that action again and take its last substep is
-    less exact, see docs/explanation/dynamics.md.) What moved by less than an estimate may err is at rest.
+    less exact, see docs/notes/dynamics.md.) What moved by less than an estimate may err is at rest.
     """
     opposite = former.quaternion * former.quaternion.new_tensor([1.0, -1.0, -1.0, -1.0])
     turn = rotations.logarithm(rotations.multiply(motion.quaternion, opposite))

@@ -1,6 +1,6 @@
 """Training the propagation network on recorded pushes.
 
-Deviations from the paper (section 4.3), measured in docs/explanation/dynamics.md: an action is predicted in four
+Deviations from the paper (section 4.3), measured in docs/notes/dynamics.md: an action is predicted in four
 substeps; the loss is a distance rather than its square, of the centre of mass and the orientation together, so that a
 few objects that topple do not outweigh all that slide; half of all is reflected. As in the paper, the loss runs over
 three actions, with gradients through all of them, but only at the end: most of the training is on single substeps from
@@ -86,7 +86,7 @@ def is_for_validation(number: int) -> bool:
 # Optimizers of training: Muon for the weight matrices, AdamW for biases, norms and the last layer.
 #
 # Muon makes every update of a matrix about as large in all its directions. On pushes, 3,000 steps with it come
-# within 2 % of what takes AdamW 16,000, for a fifth more time a step (docs/explanation/dynamics.md).
+# within 2 % of what takes AdamW 16,000, for a fifth more time a step (docs/notes/dynamics.md).
 
 
 _OTHER_RATE = 0.5  # of the matrices' rate

@@ -21,7 +21,7 @@ from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_RE
 
 CELL_M = 0.005
 CLEARANCE_M = 0.006  # between the pusher's rim and what it goes around
-# By how much an action may pass a corner: 3 mm touch less, but take longer (docs/explanation/planning.md).
+# By how much an action may pass a corner: 3 mm touch less, but take longer (docs/notes/planning.md).
 _CUT_M = 0.012
 _SIDE = round(2 * PUSHER_REACH_M / CELL_M) + 1
 _BLOCKED = 200.0  # cost of a cell too close to something, for a start in contact must be possible
