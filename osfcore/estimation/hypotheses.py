@@ -106,7 +106,7 @@ def compare_orientations(
     """Compare an object's orientation with the best of other hypotheses.
 
     None is refined where the object explains its pixels already and every hypothesis is far worse: under right
-    orientations residuals are 0.038 at most, under wrong ones 0.038 and more (`docs/explanation/estimation.md`).
+    orientations residuals are 0.038 at most, under wrong ones 0.038 and more (`docs/notes/estimation.md`).
 
     Args:
         models: fields.

@@ -7,7 +7,7 @@ scatters:
     sigma = max(softplus(g) - softplus(FLOOR), 0) / voxel                       [1 / unit of length]
     rho   = albedo * (ambient + max(n . l + network(n . l, latent, l, v, position in the cell), 0))
 
-with g, albedo, n and latent the features. Deviations from the paper, each measured in docs/explanation/fields.md:
+with g, albedo, n and latent the features. Deviations from the paper, each measured in docs/notes/fields.md:
 density, reflectance and a dipole (n) live in voxels and not in the networks, so that occupied space, silhouettes and
 shadows need no network; the ambient part of rho is kept apart, so that a shadow can remove the direct part alone.
 """

@@ -225,7 +225,7 @@ _COARSE_RATES, _FINE_RATES = Rates(2e-2, 1e-2), Rates(2e-2, 1e-3)
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a field is trained; docs/explanation/fields.md has the measurements behind the numbers.
+    """How a field is trained; docs/notes/fields.md has the measurements behind the numbers.
 
     Attributes:
         coarse_across: voxels along the longest side in the first phase.
