@@ -11,6 +11,7 @@ import uvicorn
 from fastapi import FastAPI, HTTPException, Response
 
 from osfcore import AssetLibrary, SceneRequest, Tabletop, camera_to_json, default_cameras, srgb_of_linear, to_uint8
+from osfcore.geometry.workspace import MAX_SPEED_M_S
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 BOX, TOP_SPEED_M_S, DEADMAN_S, SLICES_HZ = (-0.35, -0.35, 0.35, 0.35), 0.43, 0.2, 60.0  # the table keeps the box
@@ -60,8 +61,8 @@ def robot(table: Tabletop) -> FastAPI:
     @app.post("/act")
     def act(command: dict) -> dict:
         (x, y), seconds = command["velocity"], command["duration_s"]
-        if not 0 < seconds <= DEADMAN_S or x**2 + y**2 > TOP_SPEED_M_S**2:
-            raise HTTPException(422, f"A motion takes {DEADMAN_S} s at most, no faster than {TOP_SPEED_M_S} m/s.")
+        if not 0 < seconds <= DEADMAN_S or max(abs(x), abs(y)) > MAX_SPEED_M_S:
+            raise HTTPException(422, f"A motion takes at most {DEADMAN_S} s, at {MAX_SPEED_M_S} m/s along x and y.")
         with moving:  # when the time is over the pusher stands, whoever has gone meanwhile
             slices = table.act_steps(np.array([x, y, 0.0]), SLICES_HZ)
             while not stopped.is_set():
