@@ -31,7 +31,17 @@ export const isViewerShown = () => !byId("viewer").hidden;
 
 /** What is golden: the goal that was chosen, until an episode has found its own. */
 const golden = () => (drawsHere(known("episode")) && known("episode").done > 0 ? null : known("goal")?.id ?? null);
-const show = () => put(`views/${VISITOR}`, { replay: replayed, shows, goal: golden(), handles });
+
+async function show() {
+  const goal = golden();
+  try {
+    return await put(`views/${VISITOR}`, { replay: replayed, shows, goal, handles });
+  } catch (error) {
+    if (error.status !== 404 || !goal) throw error;
+    return null; // the goal was deleted, of which the page will be told
+  }
+}
+
 const wish = new Newest(show);
 
 /** Whether the service has a view of this page to draw in. */
