@@ -131,7 +131,9 @@ class Hand:
 def ways(browser: Browser, url: str, folder: Path) -> Iterator[str]:
     """Clicks and seconds from an open page to what somebody came for."""
     hand = Hand(browser, url)
-    hand.click("#another-table")
+    with hand.page.expect_response(lambda answer: answer.request.method == "POST" and answer.url.endswith("/scenes")):
+        hand.click("#another-table")
+    hand.page.wait_for_timeout(1000)  # as long as a person takes to look
     hand.click("#random-goal")
     hand.click("#start-episode:not([disabled])")
     yield f"random table, first push: {hand.reached('#run-stage >> text=Pushing')}"
