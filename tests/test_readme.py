@@ -7,6 +7,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 import time
 from contextlib import nullcontext
 from importlib.metadata import version
@@ -45,8 +46,12 @@ OSF = Path(sys.executable).with_name("osf")
 
 def blocks(language: str) -> list[str]:
     """Blocks of code of all guides, in the order in which they build on each other."""
-    text = "".join(guide.read_text() for guide in GUIDES)
-    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+    return code("".join(guide.read_text() for guide in GUIDES), language)
+
+
+def code(text: str, language: str) -> list[str]:
+    """Blocks of code of a text; those of list items are indented."""
+    return [textwrap.dedent(block) for block in re.findall(rf"```(?:{language})\n(.*?)```", text, flags=re.DOTALL)]
 
 
 def test_make_targets_exist():
@@ -85,14 +90,10 @@ def test_tutorials_show_commands_that_other_tests_run():
     """Those of the guides, and of the pages on robots and on extending, which have tests of their own."""
     pages = [*GUIDES, *(ROOT / "docs" / "how-to" / f"{name}.md" for name in ("robots", "extending"))]
     text = "".join(page.read_text() for page in pages)
-    tested = {
-        line
-        for block in re.findall(r"```(?:sh|console)\n(.*?)```", text, flags=re.DOTALL)
-        for line in block.splitlines()
-    }
+    tested = {line for block in code(text, "sh|console") for line in block.splitlines()}
     assert TUTORIALS
     for page in TUTORIALS:
-        shown = re.findall(r"```console\n(.*?)```", page.read_text(), flags=re.DOTALL)
+        shown = code(page.read_text(), "console")
         assert {line for block in shown for line in block.splitlines()} <= tested, page.name
         assert "```sh" not in page.read_text(), page.name
 
