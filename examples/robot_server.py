@@ -11,9 +11,9 @@ import uvicorn
 from fastapi import FastAPI, HTTPException, Response
 
 from osfcore import AssetLibrary, SceneRequest, Tabletop, camera_to_json, default_cameras, srgb_of_linear, to_uint8
-from osfcore.geometry.workspace import MAX_SPEED_M_S
 
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
+MAX_SPEED_M_S = 0.3  # along x and along y
 BOX, TOP_SPEED_M_S, DEADMAN_S, SLICES_HZ = (-0.35, -0.35, 0.35, 0.35), 0.43, 0.2, 60.0  # the table keeps the box
 
 
