@@ -831,8 +831,8 @@ def _after(
 #
 # Random velocities touch an object in one of eight sequences, so sampling alone rarely finds a path around an
 # object, let alone pushes of three objects one after another. A proposal is a whole sequence of actions for an
-# order of stages (`push_order`): a collision-free path (`path_planning`) to an object, up to three pushes toward
-# its pose (`push_sequences`) or a straight one toward its place (`push_primitives`), then the same for the next
+# order of stages (`push_orders`): a collision-free path (`osfcore.planning.paths`) to an object, up to three pushes
+# toward its pose (`ObjectPushes`) or a straight one toward its place (`straight_pushes`), then the same for the next
 # stage, as if this one had succeeded.
 
 
@@ -887,7 +887,7 @@ class PushProposals:
         return np.array(proposals[:count]).reshape(-1, horizon, 3)
 
     def recombine(self, goal: PoseGoal, rollouts: Rollouts, count: int) -> Float[np.ndarray, "P T 3"]:
-        """At most `count` sequences of pushes that succeeded in different futures (`push_recombination`).
+        """At most `count` sequences of pushes that succeeded in different futures (`recombined`).
 
         Args:
             goal: where everything should be.
