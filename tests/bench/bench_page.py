@@ -155,8 +155,9 @@ def ways(browser: Browser, url: str, folder: Path) -> Iterator[str]:
     hand.click("#new-object [type=submit]")
     hand.click("button:has-text('Put it on the table')")
     hand.click("button:has-text('Push it')")
-    hand.page.keyboard.press("Enter")
-    yield f"own mesh, first push by hand: {hand.reached('#pad .held')}"
+    with hand.page.expect_response(lambda answer: answer.url.endswith("/actions")):
+        hand.page.keyboard.press("Enter")
+    yield f"own mesh, first push by hand: {hand.reached('#pad')}"
     hand.page.context.close()
 
 
