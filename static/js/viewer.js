@@ -37,7 +37,7 @@ async function show() {
   try {
     return await put(`views/${VISITOR}`, { replay: replayed, shows, goal, handles });
   } catch (error) {
-    if (error.status !== 404 || !goal) throw error;
+    if (error.status !== 404 || !goal || replayed) throw error;
     return null; // the goal was deleted, of which the page will be told
   }
 }
@@ -67,10 +67,11 @@ function nameOnHover(view) {
   const tip = byId("pointed");
   let timer = 0;
   const name = async ({ clientX: x, clientY: y }) => {
+    const rest = timer;
     const { innerWidth: width, innerHeight: height } = view;
     const query = new URLSearchParams({ x: x / width, y: y / height });
     const pointed = (await get(`views/${VISITOR}/pointed?${query}`).catch(() => null))?.name;
-    if (!pointed || !timer) return; // has moved on
+    if (!pointed || timer !== rest) return; // has moved on
     tip.textContent = NAMES[pointed] ?? labelOf(pointed);
     tip.hidden = false;
     tip.style.left = `${Math.min(Math.max(x, tip.offsetWidth / 2), width - tip.offsetWidth / 2)}px`;

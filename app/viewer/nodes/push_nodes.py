@@ -54,11 +54,6 @@ class PushNodes:
         self._ways = add("/push/ways", NO_LINES, PREDICTED, thickness=_LINE_M, visible=False)
         self._true_ways = add("/push/true_ways", NO_LINES, TRUE, thickness=_LINE_M, visible=False)
 
-    @property
-    def moving(self) -> tuple[str, ...]:
-        """Objects that are predicted to move."""
-        return self._future.moving
-
     def plan(self, places: Float[np.ndarray, "P 2"] | None) -> None:
         """Show the way of the pusher on the table [m], or none."""
         with self._lock:
