@@ -309,11 +309,6 @@ class FutureNodes:
         """Actions until its end; 0 while none is shown."""
         return 0 if self._future is None else len(self._future.pusher[0]) - 1
 
-    @property
-    def moving(self) -> tuple[str, ...]:
-        """Objects that move in it."""
-        return tuple(name for name, node in self._ghosts.items() if node.visible)
-
     def show(self, future: Rollouts | None) -> None:
         """Show the first of some rollouts, from its beginning, in place of the one before."""
         self._future = future
