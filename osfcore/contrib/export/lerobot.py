@@ -9,16 +9,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import imageio_ffmpeg
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float, UInt8
 
-from osfcore.errors import CannotWrite, InvalidInput
+from osfcore.errors import InvalidInput
 from osfcore.extras import need
 from osfcore.geometry.workspace import STEP_S
 from osfcore.io.files import folder_at_once, write_atomically, write_json
+from osfcore.io.video_file import mp4_at_once
 
 # Keys and meanings of the features of a table.
 #
@@ -168,21 +168,10 @@ def _write_video(path: Path, images: UInt8[np.ndarray, "T h w 3"]) -> None:
         CannotWrite: if it cannot be encoded or written.
     """
     height, width = images.shape[1:3]
-    options = ["-crf", "12", "-g", _EVERY, "-bf", "0"]
-    encoder = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=FPS, codec="libx264", pix_fmt_out=_PIXELS, macro_block_size=2,
-        ffmpeg_log_level="error", output_params=options,
-    )  # fmt: skip
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()  # its error says more about the place than that of ffmpeg
-        encoder.send(None)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with mp4_at_once(path, width, height, FPS, "-crf", "12", "-g", _EVERY, "-bf", "0") as put:
         for image in images:
-            encoder.send(np.ascontiguousarray(image))
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or "it could not be encoded") from error
-    finally:
-        encoder.close()
+            put(image)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
