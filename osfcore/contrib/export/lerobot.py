@@ -96,7 +96,6 @@ def _listed(names: Sequence[str]) -> str:
 
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-_THINNED = 4  # every so many pixels of an image stand for all
 Statistics = dict[str, np.ndarray]
 
 
@@ -108,10 +107,22 @@ def statistics_of(values: Float[np.ndarray, "T D"]) -> Statistics:
 
 
 def image_statistics(images: UInt8[np.ndarray, "T h w 3"]) -> Statistics:
-    """Compute the statistics of each colour over the pixels of T images, in [0, 1], of shape (3, 1, 1)."""
-    pixels = images[:, ::_THINNED, ::_THINNED].reshape(-1, 3) / 255
-    found = {key: value.reshape(3, 1, 1) for key, value in statistics_of(pixels).items() if key != "count"}
-    return {**found, "count": np.array([len(images)])}
+    """Compute the statistics of each colour over all pixels of T images, in [0, 1], of shape (3, 1, 1).
+
+    They come from the numbers of pixels of each of the 256 values: exactly, and in little memory.
+
+    Deviation: LeRobot takes some of the images of more than 100, and of 300 px or more some of the pixels.
+    """
+    levels, found = np.arange(256) / 255, []
+    for colour in range(3):
+        counts = np.bincount(images[..., colour].reshape(-1), minlength=256)
+        values, weights = levels[counts > 0], counts[counts > 0]
+        mean = np.average(values, weights=weights)
+        deviation = np.sqrt(np.average((values - mean) ** 2, weights=weights))
+        quantiles = np.quantile(values, list(_QUANTILES.values()), method="inverted_cdf", weights=weights)
+        found.append([values[0], values[-1], mean, deviation, *quantiles])
+    names = ("min", "max", "mean", "std", *_QUANTILES)
+    return {**dict(zip(names, np.transpose(found).reshape(-1, 3, 1, 1), strict=True)), "count": np.array([len(images)])}
 
 
 def pooled(parts: Sequence[Statistics]) -> Statistics:
