@@ -56,7 +56,6 @@ def mp4_at_once(
                 raise InvalidInput("image of a video", is_now, f"uint8 {(height, width, 3)}")
             pipe.write(np.ascontiguousarray(image).data)
 
-        said = b""
         try:
             yield put
         except BrokenPipeError:
