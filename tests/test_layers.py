@@ -60,7 +60,7 @@ OWNERS = {  # who alone may import a package
     "gym_pusht": ("osfcore.experiments.pusht",),
     "pytorch_mppi": ("osfcore.experiments.pusht",),
     "foxglove": ("app.episodes.mcap",),
-    "imageio_ffmpeg": ("app.episodes.frames", "app.episodes.clip", "osfcore.contrib.export.lerobot"),
+    "imageio_ffmpeg": ("osfcore.io.video_file",),
     "pxr": ("osfcore.contrib.export.usd",),
     "pyarrow": ("osfcore.contrib.export.lerobot",),
     "fastapi": ("app",),

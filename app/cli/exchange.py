@@ -33,6 +33,8 @@ class ExportScene(DataCommand):
     """.glb or .usdz to write."""
     fields: bool = False
     """Objects as the surfaces of their fields, also where this machine has their meshes."""
+    light: bool = True
+    """The light of the scene; AR Quick Look on Apple's devices takes none, so that it needs --no-light."""
 
     def run(self) -> dict[str, Any]:
         """Export; the result lists the objects that are meshes, and those that are surfaces of fields."""
@@ -47,11 +49,12 @@ class ExportScene(DataCommand):
         library, fields = self.assets, self.trained
         scanned = [name for name in scene.state.names if library.has(name) and not self.fields]
         shapes = {n: library.load(n).mesh if n in scanned else fields.load(n) for n in scene.state.names}
-        data = export(scene, shapes, fields.load_table())
+        data = export(scene, shapes, fields.load_table(), has_light=self.light)
         write_atomically(self.out, data)
         others = [name for name in scene.state.names if name not in scanned]
         x, y, z = scene.state.light.direction
-        self.say(f"Wrote {self.out}, {len(data) / 1e6:.1f} MB; light toward ({x:.3f}, {y:.3f}, {z:.3f}).")
+        light = f"light toward ({x:.3f}, {y:.3f}, {z:.3f})" if self.light else "without light"
+        self.say(f"Wrote {self.out}, {len(data) / 1e6:.1f} MB; {light}.")
         if others:
             self.say(f"Surfaces of fields, with their albedo: {', '.join(others)}.")
         return {"out": str(self.out), "bytes": len(data), "meshes": scanned, "fields": others}

@@ -11,20 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from app.episodes.file_names import GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
 from app.episodes.trajectory import LookFrame, Moment, ReplayClock, Trajectory, read_trajectory
-from osfcore.errors import CannotWrite, OsfError
+from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
-from osfcore.io.files import as_mapping, file_at_once, read_json, reading_png
+from osfcore.io.files import as_mapping, read_json, reading_png
 from osfcore.io.image_file import to_uint8
+from osfcore.io.video_file import mp4_at_once
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.planning.mppi import PlanSketch
 from osfcore.world.imaging import RayTracer, TracedMesh
@@ -391,20 +391,10 @@ def write_clip(
         CannotWrite: if it cannot be encoded or written.
     """
     film = _Film(trajectory, goal, meshes, facts, executor)
-    with file_at_once(path) as partial:
-        encoder = imageio_ffmpeg.write_frames(
-            str(partial), (WIDTH, HEIGHT), fps=FPS, codec="libx264", macro_block_size=2, ffmpeg_log_level="error",
-            output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart", "-f", "mp4"],
-        )  # fmt: skip
-        try:
-            encoder.send(None)
-            for number, frame in enumerate(film.frames()):
-                encoder.send(np.ascontiguousarray(frame))
-                yield ClipStep(number + 1, film.count)
-        except OSError as error:
-            raise CannotWrite(path, error.strerror or "it could not be encoded") from error
-        finally:
-            encoder.close()
+    with mp4_at_once(path, WIDTH, HEIGHT, FPS, "-crf", "20", "-preset", "veryfast") as put:
+        for number, frame in enumerate(film.frames()):
+            put(frame)
+            yield ClipStep(number + 1, film.count)
 
 
 class _Film:

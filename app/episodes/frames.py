@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal
@@ -12,9 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from osfcore.errors import CannotWrite, CorruptFile, InvalidInput
+from osfcore.errors import CorruptFile
 from osfcore.geometry.workspace import STEP_S
-from osfcore.io.files import file_at_once
 from osfcore.io.image_file import to_uint8
 
 TILE_PX, _BAR_PX = 192, 16
@@ -101,18 +98,8 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]]) -> Non
     Raises:
         CannotWrite: if it cannot be encoded or written.
     """
-    import imageio_ffmpeg  # here: frames are drawn without it
+    from osfcore.io.video_file import mp4_at_once  # here: frames are drawn without ffmpeg
 
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
-    command += ["-s", f"{WIDTH}x{HEIGHT}", "-r", f"{1 / STEP_S:g}", "-i", "-", "-an", "-vcodec", "libx264"]
-    command += ["-pix_fmt", "yuv420p", "-crf", "15", "-f", "mp4"]
-    with file_at_once(path) as partial, tempfile.TemporaryFile() as raw:
+    with mp4_at_once(path, WIDTH, HEIGHT, 1 / STEP_S, "-crf", "15") as put:
         for picture in frames:
-            if picture.shape != (HEIGHT, WIDTH, 3) or picture.dtype != np.uint8:
-                is_now = f"{picture.dtype} {picture.shape}"
-                raise InvalidInput("frame of a video", is_now, f"uint8 {(HEIGHT, WIDTH, 3)}")
-            raw.write(picture.tobytes())
-        raw.seek(0)
-        done = subprocess.run([*command, str(partial)], stdin=raw, capture_output=True, check=False)
-        if done.returncode:
-            raise CannotWrite(path, "ffmpeg could not encode it")
+            put(picture)

@@ -38,7 +38,7 @@ from osfcore.objects.mesh import MAX_TEXTURE_SIDE
 TABLE_FRAME = "z_up"  # the node above all others
 LIGHT_NODE = "light"
 LIGHTS_EXTENSION, UNLIT_EXTENSION = "KHR_lights_punctual", "KHR_materials_unlit"
-_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 OPENCV_TO_GLTF = np.diag([1.0, -1, -1, 1])  # cameras of glTF and USD look along -z with y up
 _NEAR_M = 0.01
 _MATTE = {"metallicFactor": 0.0, "roughnessFactor": 1.0}  # glTF's default is polished metal
@@ -62,7 +62,7 @@ def glb(
     """
     graph, base = scene.graph, scene.graph.base_frame
     placed = [(node, *graph.get(node)) for node in graph.nodes_geometry]
-    graph.update(frame_from=base, frame_to=TABLE_FRAME, matrix=_Y_UP)
+    graph.update(frame_from=base, frame_to=TABLE_FRAME, matrix=Y_UP)
     for node, matrix, geometry in placed:
         graph.update(frame_from=TABLE_FRAME, frame_to=node, matrix=matrix, geometry=geometry)
     for camera in cameras:
@@ -260,7 +260,9 @@ def _pusher_mesh() -> trimesh.Trimesh:
     return mesh
 
 
-def scene_glb(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table: TableField) -> bytes:
+def scene_glb(
+    scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table: TableField, *, has_light: bool = True
+) -> bytes:
     """Encode a scene with its cameras and light as binary glTF, for Blender, game engines and browsers.
 
     Nodes bear the names that `scene_meshes` gives, "light", and "camera NAME".
@@ -270,8 +272,10 @@ def scene_glb(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table:
         shapes: of each object by name, a mesh, which keeps its texture, or a field, which becomes a mesh with its
             albedo on the vertices.
         table: whose albedo becomes the table's texture.
+        has_light: False to leave the light out.
 
     Raises:
         InvalidInput: if nothing in a field is solid.
     """
-    return glb(scene_meshes(scene, shapes, table), cameras=scene.cameras, light=scene.state.light)
+    light = scene.state.light if has_light else None
+    return glb(scene_meshes(scene, shapes, table), cameras=scene.cameras, light=light)

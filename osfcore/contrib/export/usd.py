@@ -1,7 +1,7 @@
 """Scenes and fields as Universal Scene Description (USD), for Omniverse, Houdini, Maya, Blender and Apple's devices.
 
-Axes: z up, in metres, as here. One prim, /World, holds everything. Names of prims are made of letters, digits and
-underscores; the exact ones are their display names.
+Axes: y up, which Apple's devices ask for, in metres. Below one prim, /World/z_up, everything has the coordinates that
+it has here. Names of prims are made of letters, digits and underscores; the exact ones are their display names.
 
 Raises:
     MissingExtra: on import, if Pixar's library is not installed.
@@ -20,7 +20,15 @@ import trimesh
 from jaxtyping import Float
 from trimesh.visual import TextureVisuals
 
-from osfcore.contrib.export.meshes import OPENCV_TO_GLTF, camera_node, field_meshes, light_matrix, scene_meshes
+from osfcore.contrib.export.meshes import (
+    OPENCV_TO_GLTF,
+    TABLE_FRAME,
+    Y_UP,
+    camera_node,
+    field_meshes,
+    light_matrix,
+    scene_meshes,
+)
 from osfcore.extras import need
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
@@ -34,6 +42,8 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, Vt  # noq
 
 _FILM = 0.36  # width of the film in tenths of a metre, as USD has it: 36 mm
 _CLIPPING_M = (0.01, 100.0)
+_WORLD = Sdf.Path("/World")
+_BASE = _WORLD.AppendChild(TABLE_FRAME)
 _TYPES, _TEXTURES = Sdf.ValueTypeNames, "textures"
 
 
@@ -85,11 +95,11 @@ def bind_material(stage: Usd.Stage, prim: UsdGeom.Mesh, mesh: trimesh.Trimesh, f
 
 
 def free_path(shown: dict[Sdf.Path, str], name: str) -> Sdf.Path:
-    """Reserve a path below /World for a name of any characters, in a dictionary of those that are taken."""
+    """Reserve a path below /World/z_up for a name of any characters, in a dictionary of those that are taken."""
     stem = Tf.MakeValidIdentifier(name if name[:1].isalpha() else f"_{name}")  # 006 would become _06
-    path, numbers = Sdf.Path(f"/World/{stem}"), itertools.count(2)
+    path, numbers = _BASE.AppendChild(stem), itertools.count(2)
     while path in shown:
-        path = Sdf.Path(f"/World/{stem}_{next(numbers)}")
+        path = _BASE.AppendChild(f"{stem}_{next(numbers)}")
     shown[path] = name
     return path
 
@@ -150,7 +160,9 @@ def _place(prim: UsdGeom.Xformable, matrix: Float[np.ndarray, "4 4"]) -> None:
     prim.AddTransformOp().Set(Gf.Matrix4d(np.asarray(matrix, float).T.tolist()))  # of rows of points, from the left
 
 
-def scene_usdz(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table: TableField) -> bytes:
+def scene_usdz(
+    scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table: TableField, *, has_light: bool = True
+) -> bytes:
     """Encode a scene under its light, with its textures in one file; see `add_light` and `add_camera`.
 
     Args:
@@ -158,11 +170,13 @@ def scene_usdz(scene: Scene, shapes: Mapping[str, TexturedMesh | KiloOSF], table
         shapes: of each object by name, a mesh, which keeps its texture, or a field, which becomes a mesh with its
             albedo on the vertices.
         table: whose albedo becomes the table's texture.
+        has_light: False to leave the light out; AR Quick Look on Apple's devices takes no lights.
 
     Raises:
         InvalidInput: if nothing in a field is solid.
     """
-    return _content(scene_meshes(scene, shapes, table), cameras=scene.cameras, light=scene.state.light)
+    light = scene.state.light if has_light else None
+    return _content(scene_meshes(scene, shapes, table), cameras=scene.cameras, light=light)
 
 
 def field_usd(field: KiloOSF, name: str, light: Light | None = None, *, is_packed: bool = True) -> bytes:
@@ -193,10 +207,10 @@ def _content(
     with tempfile.TemporaryDirectory(prefix="osf-usd-") as folder:
         layer = Path(folder) / "scene.usdc"
         stage = Usd.Stage.CreateNew(str(layer))
-        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        world = UsdGeom.Xform.Define(stage, "/World")
-        stage.SetDefaultPrim(world.GetPrim())
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, _WORLD).GetPrim())
+        _place(UsdGeom.Xform.Define(stage, _BASE), Y_UP)
         shown: dict[Sdf.Path, str] = {}  # the exact names, by path
         for node in scene.graph.nodes_geometry:
             matrix, geometry = scene.graph.get(node)

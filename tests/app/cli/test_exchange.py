@@ -63,6 +63,9 @@ def test_a_scene_comes_with_meshes_where_there_are_some(rendered, data_dir, tmp_
     assert len(content) == result["bytes"]
     read = trimesh.load_scene(io.BytesIO(content), file_type="glb")
     assert set(NAMES) | {"table", "pusher"} == set(read.geometry)
+    assert b"KHR_lights_punctual" in content
+    assert main([*arguments, "--data-dir", str(data_dir), "--no-light"]) == 0
+    assert b"KHR_lights_punctual" not in (tmp_path / "scene.glb").read_bytes()
 
 
 def test_a_field_from_a_file_becomes_a_mesh(field_file, tmp_path, capsys):
@@ -82,6 +85,10 @@ def test_the_same_comes_as_usd(rendered, field_file, tmp_path, capsys, data_dir)
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdz"))
     kinds = [prim.GetTypeName() for prim in stage.Traverse()]
     assert (kinds.count("Mesh"), kinds.count("Camera"), kinds.count("DistantLight")) == (4, 4, 1)
+    arguments[arguments.index("--out") + 1] = str(tmp_path / "unlit.usdz")
+    assert main([*arguments, "--data-dir", str(data_dir), "--no-light"]) == 0
+    unlit = Usd.Stage.Open(str(tmp_path / "unlit.usdz"))
+    assert "DistantLight" not in [prim.GetTypeName() for prim in unlit.Traverse()]
     for suffix in (".usdz", ".usdc"):
         out = tmp_path / f"solid{suffix}"
         assert main(["export", "field", str(field_file), "--out", str(out), "--light", "1", "0", "1"]) == 0

@@ -36,11 +36,20 @@ def test_statistics_of_parts_are_those_of_the_whole_with_quantiles_in_order(part
     assert np.all(np.diff(ordered, axis=0) >= -1e-9)
 
 
-def test_statistics_of_images_are_those_of_their_colours():
-    found = image_statistics(np.broadcast_to(np.array([0, 51, 255], np.uint8), (4, 8, 8, 3)))
+@pytest.mark.parametrize("side", [64, 320])
+def test_statistics_of_images_are_those_of_all_their_pixels(side):
+    images = np.random.default_rng(0).integers(0, (200, 90, 256), (4, side, side, 3), dtype=np.uint8)
+    images[:, ::4, ::4] //= 2  # what every fourth pixel has, the others need not have
+    found, pixels = image_statistics(images), images.reshape(-1, 3) / 255
     assert found["count"].tolist() == [4]
-    for key, colours in (("mean", [0, 0.2, 1]), ("std", [0, 0, 0])):
-        np.testing.assert_allclose(found[key], np.reshape(colours, (3, 1, 1)), atol=1e-12)
+    expected = {"min": pixels.min(axis=0), "max": pixels.max(axis=0), "mean": pixels.mean(axis=0)}
+    expected |= {
+        "std": pixels.std(axis=0),
+        "q10": np.quantile(pixels, 0.1, axis=0),
+        "q99": np.quantile(pixels, 0.99, axis=0),
+    }
+    for key, colours in expected.items():
+        np.testing.assert_allclose(found[key], colours[:, None, None], atol=1e-9)
 
 
 def test_each_number_of_an_environment_state_has_its_name():

@@ -1,6 +1,7 @@
 """Exported scenes as Pixar's library reads them: geometry, colours, cameras and light; its own checks find nothing."""
 
 import io
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -31,8 +32,13 @@ def shown_as(stage, name):
 
 
 def pose_of(prim):
-    """`T_world_prim`; USD's matrices act on rows."""
-    return np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
+    """`T_world_prim`, of the world with z up; USD's matrices act on rows."""
+    world = prim.GetStage().GetPrimAtPath("/World/z_up")
+    return np.array(UsdGeom.XformCache().ComputeRelativeTransform(prim, world)[0]).T
+
+
+def shown_with_y_up(points):
+    return points[:, [0, 2, 1]] * [1, 1, -1]
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +55,7 @@ def assert_faultless(stage):
 
 def test_everything_stands_where_the_scene_says(scene, stage, library):
     assert_faultless(stage)
-    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert stage.GetDefaultPrim().GetPath() == "/World"
     for name in scene.state.names:
@@ -72,13 +78,23 @@ def test_the_light_is_the_parallel_and_the_ambient_one(stage, light):
     assert UsdLux.DomeLight(dome).GetIntensityAttr().Get() == 0.25
 
 
+def test_without_light_it_is_what_apples_devices_take(scene, shapes, tmp_path, one_thread):
+    """By the rules of `usdchecker --arkit` for types of prims, up axis and files."""
+    content = scene_usdz(Scene(scene.state, CAMERAS), shapes, FieldLibrary(None).load_table(), has_light=False)
+    stage = opened(content, tmp_path)
+    assert_faultless(stage)
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert {prim.GetTypeName() for prim in stage.Traverse()} == {"Xform", "Mesh", "Material", "Shader", "Camera"}
+    assert {name.rpartition(".")[2] for name in ZipFile(io.BytesIO(content)).namelist()} == {"usdc", "jpg"}
+
+
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
 def test_cameras_see_points_where_ours_do(stage, camera):
     prim = shown_as(stage, f"camera {camera.name}")
     frustum = UsdGeom.Camera(prim).GetCamera(Usd.TimeCode.Default()).frustum
     matrix = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3))
-    seen = np.array([matrix.Transform(Gf.Vec3d(*point)) for point in points.tolist()])
+    seen = np.array([matrix.Transform(Gf.Vec3d(*point)) for point in shown_with_y_up(points).tolist()])
     pixels = np.stack([(1 + seen[:, 0]) / 2 * camera.width, (1 - seen[:, 1]) / 2 * camera.height], axis=1)
     np.testing.assert_allclose(pixels, camera.project(points), atol=1e-3)
 
