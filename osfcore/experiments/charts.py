@@ -53,7 +53,7 @@ _CHANGES = (  # that make a drawing small, and fit to stand in a page with other
     (r' id="[\w.]+_\d+"', ""),  # of groups, which would stand in a page several times; those that are used have no _
     (r" font-family: [^;]*;", ""),
     (r' transform="rotate\(-0 [^)]*\)"', ""),
-    (r"(\.\d\d)\d+", r"\1"),
+    (r"<[^>]*>", lambda tag: re.sub(r"(\.\d\d)\d+", r"\1", tag[0])),  # not what is written at the axes
     (r"\s+", " "),
     ("> <", "><"),
     (_INK, "currentColor"),

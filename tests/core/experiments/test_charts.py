@@ -73,6 +73,7 @@ def test_a_drawing_says_what_it_shows():
     words = "".join(root.itertext())
     for word in ("x [mm]", "share", "up", "long & <wide>"):
         assert word in words
+    assert ">0.005" in svg([chart(RISING, y=Axis("y", 0, 0.02))])  # in full
 
 
 def test_a_file_has_a_background(tmp_path):
