@@ -615,7 +615,7 @@ def dynamics_part(_folder: Path, reports: Mapping[str, Mapping[str, Any]]) -> Pa
     still = next(iter(reports.values()))
     predicted = {TITLES[method]: (report, "median") for method, report in reports.items()}
     predicted |= {"quasi-static": (still, "analytic"), "no motion": (still, "constant")}
-    heads = [f"{horizon} steps [{unit}]" for horizon in _HORIZONS for unit in ("mm", "deg")]
+    heads = [f"{_counted(horizon, 'action')} [{unit}]" for horizon in _HORIZONS for unit in ("mm", "deg")]
     rows = []
     for title, (report, key) in predicted.items():
         cells = [report[f"{key}_{unit}_{horizon}"] for horizon in _HORIZONS for unit in ("mm", "deg")]
@@ -781,7 +781,7 @@ def reproduce(config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, exe
 
     Raises:
         UnknownName, MissingAssets: if an object lacks a field or a mesh.
-        InvalidInput: if a number or name is out of range.
+        InvalidInput: if a number or name is out of range, or only finished episodes are wanted and there are none.
         MissingExtra: if what writes pages or draws charts is not installed.
         NoRoom, WorkerDied, CorruptFile, CannotWrite: as for evaluations.
     """
@@ -803,6 +803,9 @@ def reproduce(config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, exe
     sections = asked = sections_of(base, config.scale, chosen)
     if config.is_finished:
         sections = only_finished(asked, fields, assets)
+        if not (sections or images):
+            allowed = "one with tasks of two methods or more, of the same seed, objects and number of actions"
+            raise InvalidInput("folder of finished episodes", config.folder, allowed)
     measured = yield from measure_cells(sections, fields, assets, executor)
     report = _figures(config, images, measured)
     write_json(config.folder / FIGURES_FILE, report)
