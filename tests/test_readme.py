@@ -81,7 +81,7 @@ def test_commands_run(data_dir, tmp_path, record_property):
         assert read_field(tmp_path / "fields" / f"{name}.safetensors").hidden > 0
     page = (tmp_path / "report" / "report.html").read_text()
     assert "Where episodes fail" in page
-    assert "A quick look and no measurement: 1 tasks a cell, 1 actions instead of 30" in page
+    assert "A quick look and no measurement: 1 task a cell, 1 action instead of 30" in page
     (section,) = json.loads((tmp_path / "report" / "reproduction.json").read_text())["sections"]
     assert all(cell["figures"]["steps_median"] <= 1 for cell in section["cells"])
 

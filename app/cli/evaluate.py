@@ -450,7 +450,7 @@ class ReproduceCommand(DataCommand):
     """
 
     out: Path
-    """Folder for report.html, its figures as JSON, its pictures, and the results of all tasks."""
+    """Folder for report.html, the same as report.md, the figures as JSON, and the results of all tasks."""
     quick: bool = False
     """A look in a quarter of an hour on two cores: three tasks a cell, short episodes, fewer cells."""
     only: tuple[
@@ -472,6 +472,8 @@ class ReproduceCommand(DataCommand):
     """Objects; by default all of which every method has a field."""
     photos: Path | None = None
     """Folder of photographs as 'osf eval photos' takes them; without one the part on photographs is left out."""
+    finished: bool = False
+    """Run no more episodes: report those that are finished, those of 'osf eval mpc' in the same folder among them."""
     workers: int = 2
     """Processes that work side by side."""
     cluster: str | None = None
@@ -487,8 +489,9 @@ class ReproduceCommand(DataCommand):
         called = shlex.join(["osf", *sys.argv[1:]])
         about = paper.About(date.today().isoformat(), f"{os.cpu_count()} cores, {system}", called, self.seed, ())
         config = paper.Reproduce(
-            self.out, self.data_dir, about, scale, self.quick, self.only or paper.PARTS, self.names, self.photos
-        )
+            self.out, self.data_dir, about, scale, self.quick, self.only or paper.PARTS, self.names, self.photos,
+            self.finished,
+        )  # fmt: skip
         with worker_pool(self.workers, self.cluster) as executor:
             report = report_of(paper.reproduce(config, self.trained, self.assets, executor))
         self.say(*report["findings"], f"The report: {self.out / paper.PAGE_FILE}")

@@ -1,8 +1,10 @@
-"""Line charts of evaluations, drawn by matplotlib."""
+"""Charts of evaluations, drawn as SVG by matplotlib."""
 
 from __future__ import annotations
 
+import html
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +16,48 @@ from jaxtyping import Float
 from osfcore.extras import need
 from osfcore.io.files import write_atomically
 
-_PANEL_IN = (4.6, 3.4)  # width and height
-_BARS_IN = (6.4, 0.28)  # width, and height of each bar
-_SHADE = 0.15
+_WIDTH_IN = 3.7  # of a chart: two stand side by side on the site, and a phone shows one almost in its full size
+_CURVES_IN, _LEGEND_IN = 2.9, 0.19  # heights: of axes with their labels, and of a row of the legend below them
+_LEGEND_COLUMNS, _LEGEND_AT = 2, (0.5, -0.19)
+_BARS_IN, _BAR_IN = 1.0, 0.28  # heights: of what is around the bars, and of a bar
+_SHADE = 0.1
+# Each has a contrast of 3 or more to white and to the dark page of the site.
+_BLUE, _ORANGE, _GREEN, _RED, _PURPLE = "#1f77b4", "#d9600a", "#2a962a", "#d62728", "#9467bd"
+_PINK, _TEAL, _OLIVE, _BROWN, _GREY = "#d0559b", "#0e8a9a", "#8f8a10", "#9c6050", "#7f7f7f"
+_COLOURS = (_BLUE, _ORANGE, _GREEN, _RED, _PURPLE, _PINK, _TEAL, _OLIVE, _BROWN, _GREY)
+_KNOWN = {  # what stands in several charts has one colour in all of them
+    "ours": _BLUE,
+    "as published": _ORANGE,
+    **dict.fromkeys(("NeRF", "compositional NeRF"), _GREEN),
+    **dict.fromkeys(("FitVid", "visual foresight"), _RED),
+    "light overhead": _PURPLE,
+    "light known": _PINK,
+    "told the truth": _TEAL,
+    "NeRF, brightness fitted": _OLIVE,
+    "quasi-static": _BROWN,
+    **dict.fromkeys(("no action", "no motion", "last frame"), _GREY),
+}
+_INK = "#010203"  # stands for the colour of the text around a chart; nothing else is drawn in it
+_STYLE: dict[Any, Any] = {  # of matplotlib, whose keys are literals
+    "axes.facecolor": "none",
+    "legend.fontsize": "small",
+    "legend.frameon": False,
+    "svg.fonttype": "none",  # text stays text
+    **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _INK),
+    "grid.color": _INK,
+}
+_NO_METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+_CHANGES = (  # that make a drawing small, and fit to stand in a page with others
+    (r"^.*?(?=<svg )", ""),  # what an SVG file begins with
+    (r"<style.*?</style>", ""),  # would hold for the whole page
+    (r' id="[\w.]+_\d+"', ""),  # of groups, which would stand in a page several times; those that are used have no _
+    (r" font-family: [^;]*;", ""),
+    (r' transform="rotate\(-0 [^)]*\)"', ""),
+    (r"<[^>]*>", lambda tag: re.sub(r"(\.\d\d)\d+", r"\1", tag[0])),  # not what is written at the axes
+    (r"\s+", " "),
+    ("> <", "><"),
+    (_INK, "currentColor"),
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,61 +108,93 @@ class Bar:
     high: float
 
 
-def write_charts(path: Path, charts: Sequence[Chart]) -> None:
-    """Draw charts in a row as PNG.
+@dataclass(frozen=True, slots=True)
+class Bars:
+    """Horizontal bars with their intervals, the first one on top."""
+
+    title: str
+    x: Axis
+    bars: Sequence[Bar]
+
+
+def write_charts(path: Path, charts: Sequence[Chart | Bars]) -> None:
+    """Draw charts in a row as an SVG file, on white.
 
     Raises:
         CannotWrite: if the disk refuses.
         MissingExtra: if matplotlib is not installed.
     """
-    figure = _figure(_PANEL_IN[0] * len(charts), _PANEL_IN[1])
-    panels = np.atleast_1d(figure.subplots(1, len(charts)))
-    for panel, chart in zip(panels, charts, strict=True):
-        for curve in chart.curves:
-            (line,) = panel.plot(curve.x, curve.y, marker="o" if curve.dots else None, label=curve.name)
-            if curve.band is not None:
-                panel.fill_between(curve.x, *curve.band, color=line.get_color(), alpha=_SHADE, linewidth=0)
-        panel.set(title=chart.title, xlabel=chart.x.label, ylabel=chart.y.label)
-        panel.set_xlim(chart.x.low, chart.x.high)
-        panel.set_ylim(chart.y.low, chart.y.high)
-        panel.grid(alpha=0.3)
-        if chart.curves:
-            panel.legend(fontsize="small")
-    _write(path, figure)
+    write_atomically(path, svg(charts, "white").encode())
 
 
-def write_bars(path: Path, title: str, axis: Axis, bars: Sequence[Bar]) -> None:
-    """Draw horizontal bars with their intervals as PNG, the first one on top.
+def svg(charts: Sequence[Chart | Bars], paper: str = "none") -> str:
+    """Draw charts in a row as SVG that can stand in a page, where text and axes take the colour of the text around.
+
+    Equal charts give equal SVGs.
+
+    Args:
+        charts: from left to right.
+        paper: colour behind them.
 
     Raises:
-        CannotWrite: if the disk refuses.
         MissingExtra: if matplotlib is not installed.
     """
-    figure = _figure(_BARS_IN[0], 1.0 + _BARS_IN[1] * len(bars))
-    panel = figure.subplots()
-    values = np.array([bar.value for bar in bars])
-    ends = np.array([[bar.value - bar.low, bar.high - bar.value] for bar in bars]).reshape(-1, 2).T.clip(min=0)
-    panel.barh(np.arange(len(bars)), values, xerr=ends, capsize=2, height=0.7)
-    panel.set_yticks(np.arange(len(bars)), [bar.label for bar in bars])
-    panel.invert_yaxis()
-    panel.set(title=title, xlabel=axis.label)
-    panel.set_xlim(axis.low, axis.high)
-    panel.grid(axis="x", alpha=0.3)
-    _write(path, figure)
-
-
-def _figure(width: float, height: float) -> Any:  # noqa: ANN401 - of matplotlib, an extra
-    """Return an empty figure of a size [inch]."""
     need("experiments", "A chart")
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    return Figure((width, height), layout="constrained")
+    name = "; ".join(f"{chart.title}: {_axes_in_words(chart)}".removeprefix(": ") for chart in charts)
+    drawing = io.StringIO()
+    with rc_context({**_STYLE, "svg.hashsalt": name}):
+        size = _WIDTH_IN * len(charts), max(map(_height_in, charts))
+        figure = Figure(size, layout="constrained", facecolor=paper)
+        for panel, chart in zip(np.atleast_1d(figure.subplots(1, len(charts))), charts, strict=True):
+            if isinstance(chart, Bars):
+                _draw_bars(panel, chart)
+            else:
+                _draw_curves(panel, chart)
+        figure.savefig(drawing, format="svg", metadata=_NO_METADATA)
+    text = drawing.getvalue()
+    for pattern, replacement in _CHANGES:
+        text = re.sub(pattern, replacement, text, flags=re.DOTALL)
+    about = f'role="img" aria-label="{html.escape(name)}" font-family="system-ui, sans-serif" stroke-linejoin="round"'
+    return text.replace("<svg ", f"<svg {about} ", 1).strip()
 
 
-def _write(path: Path, figure: Any) -> None:  # noqa: ANN401
-    picture = io.BytesIO()
-    figure.savefig(picture)
-    write_atomically(path, picture.getvalue())
+def _axes_in_words(chart: Chart | Bars) -> str:
+    return chart.x.label if isinstance(chart, Bars) else f"{chart.y.label} over {chart.x.label}"
+
+
+def _height_in(chart: Chart | Bars) -> float:
+    if isinstance(chart, Bars):
+        return _BARS_IN + _BAR_IN * len(chart.bars)
+    return _CURVES_IN + _LEGEND_IN * -(-len(chart.curves) // _LEGEND_COLUMNS)
+
+
+def _draw_curves(panel: Any, chart: Chart) -> None:  # noqa: ANN401 - of matplotlib, an extra
+    for number, curve in enumerate(chart.curves):
+        colour = _KNOWN.get(curve.name, _COLOURS[number % len(_COLOURS)])
+        panel.plot(curve.x, curve.y, marker="." if curve.dots else None, label=curve.name, color=colour)
+        if curve.band is not None:
+            panel.fill_between(curve.x, *curve.band, color=colour, alpha=_SHADE, linewidth=0)
+    panel.set(title=chart.title, xlabel=chart.x.label, ylabel=chart.y.label)
+    panel.set_xlim(chart.x.low, chart.x.high)
+    panel.set_ylim(chart.y.low, chart.y.high)
+    panel.grid(alpha=0.3)
+    if chart.curves:
+        panel.legend(loc="upper center", bbox_to_anchor=_LEGEND_AT, ncols=_LEGEND_COLUMNS)
+
+
+def _draw_bars(panel: Any, chart: Bars) -> None:  # noqa: ANN401
+    bars, rows = chart.bars, np.arange(len(chart.bars))
+    ends = np.array([[bar.value - bar.low, bar.high - bar.value] for bar in bars]).reshape(-1, 2).T.clip(min=0)
+    lengths = [bar.value for bar in bars]
+    panel.barh(rows, lengths, xerr=ends, capsize=2, height=0.7, color=_BLUE, ecolor=_INK)
+    panel.set_yticks(rows, [bar.label for bar in bars])
+    panel.invert_yaxis()
+    panel.set(title=chart.title, xlabel=chart.x.label)
+    panel.set_xlim(chart.x.low, chart.x.high)
+    panel.grid(axis="x", alpha=0.3)
 
 
 def cumulative(name: str, values: Sequence[float], axis: Axis, total: int | None = None) -> Curve:

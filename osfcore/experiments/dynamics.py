@@ -477,7 +477,7 @@ _PAPER, _START, _TRUE, _PREDICTED, _PUSHER = 255, (190, 190, 190), (44, 160, 44)
 
 
 def write_plots(folder: Path, report: DynamicsReport) -> None:
-    """Draw dynamics.png: median errors by horizon, against doing without, and by number of objects.
+    """Draw dynamics.svg: median errors by horizon, against doing without, and by number of objects.
 
     Raises:
         CannotWrite: if the disk refuses.
@@ -490,7 +490,7 @@ def write_plots(folder: Path, report: DynamicsReport) -> None:
         panels.append(_panel("Objects that moved, 3 in a scene", label, curves))
     curves = [_curve(f"{count} objects", report.of_count(count), "network") for count in report.counts]
     panels.append(_panel("Graph network", "median position error [mm]", curves))
-    write_charts(folder / "dynamics.png", panels)
+    write_charts(folder / "dynamics.svg", panels)
 
 
 def _curve(name: str, scored: Sequence[Scored], who: str, *, deg: bool = False) -> Curve:

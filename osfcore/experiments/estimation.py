@@ -893,17 +893,17 @@ _POSITION, _ROTATION = Axis("position error [mm]", 0, 20), Axis("rotation error 
 
 
 def write_plots(folder: Path, report: EstimateReport) -> None:
-    """Draw errors.png and calibration.png, and track.png and views.png where these parts were measured.
+    """Draw errors.svg and calibration.svg, and track.svg and views.svg where these parts were measured.
 
     Raises:
         CannotWrite: if the disk refuses.
     """
-    write_charts(folder / "errors.png", _errors_charts(report))
-    write_charts(folder / "calibration.png", [_calibration_chart(report.first)])
+    write_charts(folder / "errors.svg", _errors_charts(report))
+    write_charts(folder / "calibration.svg", [_calibration_chart(report.first)])
     if report.tracks:
-        write_charts(folder / "track.png", _track_charts(report.tracks))
+        write_charts(folder / "track.svg", _track_charts(report.tracks))
     if report.views is not None:
-        write_charts(folder / "views.png", _views_charts(report))
+        write_charts(folder / "views.svg", _views_charts(report))
 
 
 def _errors_charts(report: EstimateReport) -> list[Chart]:

@@ -231,6 +231,10 @@ class Piece:
     circumstances: Mapping[str, Any]
     work: Callable[[], TaskResult]
 
+    def is_done(self) -> bool:
+        """Return whether its result is kept."""
+        return self.cache.read(self.name, self.circumstances) is not None
+
 
 def results_of(pieces: Sequence[Piece], executor: Executor | None = None) -> Iterator[list[TaskResult | None]]:
     """Do what is not done yet, and yield all results so far, in the order of the pieces, after each that was done.

@@ -237,11 +237,10 @@ def compare(
     about: Mapping[str, Any],
     measures: Sequence[str],
     spans: Mapping[str, Sequence[int]],
-    x: Axis,
-    places: Sequence[float],
+    charts: Callable[[Mapping[str, Any]], Sequence[Chart]],
     picture: Callable[[Mapping[str, TaskResult]], UInt8[np.ndarray, "H W 3"]],
 ) -> Iterator[EvaluationStep[dict[str, Any]]]:
-    """Do all tasks by all methods, and write the report as JSON, charts of PSNR and SSIM along x, and a picture.
+    """Do all tasks by all methods, and write the report as JSON, its charts, and a picture.
 
     Args:
         config: what to compare.
@@ -251,8 +250,7 @@ def compare(
         about: begins the report.
         measures: names of figures; a result has a list of each along x, with None where there is no figure.
         spans: indices along x over which means are reported, by name.
-        x: axis along which is measured.
-        places: on it; NaN for what has none and is left out of the charts.
+        charts: draws the report.
         picture: draws the first results of the methods.
 
     Raises:
@@ -267,9 +265,8 @@ def compare(
         for method, part in results.items()
     }
     report = {**about, **summary(tables, spans)}
-    axes = (("psnr", "PSNR [dB]", 5.0), ("ssim", "SSIM", 0.1))
     report_file, chart_file, picture_file = (config.folder / name for name in files)
-    write_charts(chart_file, [chart_of(tables, key, x, places, label, tick) for key, label, tick in axes])
+    write_charts(chart_file, charts(report))
     write_json(report_file, report)
     write_png(picture_file, picture({method: part[0] for method, part in results.items()}))
     yield EvaluationStep(len(pieces), len(pieces), "Everything is measured", report)
@@ -309,24 +306,23 @@ def summary(tables: Tables, spans: Mapping[str, Sequence[int]]) -> dict[str, Any
     return {"methods": methods, "against": against}
 
 
-def chart_of(tables: Tables, key: str, x: Axis, places: Sequence[float], label: str, tick: float) -> Chart:
-    """Draw the means of one measure over tasks, a curve for each method.
+def image_charts(report: Mapping[str, Any], x: Axis, places: Sequence[float]) -> list[Chart]:
+    """Draw the means of PSNR and SSIM over tasks, a curve for each method.
 
     Args:
-        tables: of the methods.
-        key: of the measure.
-        x: axis along which it was measured.
-        places: on it; what has none, NaN, is not drawn.
-        label: of the measure, with its unit.
-        tick: the axis of the measure begins at a multiple of it.
+        report: of `compare`.
+        x: axis along which was measured.
+        places: on it; figures behind the last one are not drawn.
     """
-    means = {m: np.array([_mean(column) for column in part[key].T], float) for m, part in tables.items()}
-    lowest = min(float(np.nanmin(values, initial=np.inf)) for values in means.values())
-    low = tick * np.floor(lowest / tick) if np.isfinite(lowest) else 0.0
-    at = np.asarray(places, float)
-    known = np.isfinite(at)
-    curves = [Curve(TITLES[method], at[known], values[known], dots=True) for method, values in means.items()]
-    return Chart("", x, Axis(label, low), curves)
+    charts = []
+    for key, label, tick in (("psnr", "PSNR [dB]", 5.0), ("ssim", "SSIM", 0.1)):
+        means = {m: np.array(part[key]["along"][: len(places)], float) for m, part in report["methods"].items()}
+        lowest = min(float(np.nanmin(values, initial=np.inf)) for values in means.values())
+        low = tick * np.floor(lowest / tick) if np.isfinite(lowest) else 0.0
+        at = np.asarray(places, float)
+        curves = [Curve(TITLES[method], at, values, dots=True) for method, values in means.items()]
+        charts.append(Chart("", x, Axis(label, low), curves))
+    return charts
 
 
 def _task_means(table: Float[np.ndarray, "tasks x"], at: Sequence[int]) -> Float[np.ndarray, "tasks"]:

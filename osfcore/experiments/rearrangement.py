@@ -442,7 +442,7 @@ def scores_of(results: Sequence[TaskResult], key: str) -> list[RearrangementScor
 
 
 def write_pictures(folder: Path, report: MpcReport) -> None:
-    """Draw mpc.png, success by threshold and errors of 6D poses, and mpc_tasks.png, goals and what was reached.
+    """Draw mpc.svg, success by threshold and errors of 6D poses, and mpc_tasks.png, goals and what was reached.
 
     Raises:
         CannotWrite: if the disk refuses.
@@ -458,7 +458,7 @@ def write_pictures(folder: Path, report: MpcReport) -> None:
     reached = [cumulative(name, errors, mm) for name, errors in farthest.items()]
     poses = [cumulative(name, [score.pose6d for score in scores], sixd) for name, scores in kinds.items()]
     charts = (Chart("Objects that had to move", mm, share, reached), Chart("6D poses, all objects", sixd, share, poses))
-    write_charts(folder / "mpc.png", charts)
+    write_charts(folder / "mpc.svg", charts)
     shown = [comparison for result in report.ours for comparison in result.shown]
     write_png(folder / "mpc_tasks.png", contact_sheet(shown, per_row=_PER_ROW, truth="goal"))
 

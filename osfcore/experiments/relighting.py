@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from osfcore.errors import InvalidInput
-from osfcore.experiments.charts import Axis
+from osfcore.experiments.charts import Axis, Chart
 from osfcore.experiments.factors import factor_named
 from osfcore.experiments.fields import MEASURES, SCENE_QUALITY, compare_scene, figures_of, render_scene, simulate_relit
 from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult
@@ -28,6 +28,7 @@ from osfcore.experiments.images import (
     CompareImages,
     checked,
     compare,
+    image_charts,
     load_appearance,
     shown_circumstances,
 )
@@ -44,7 +45,7 @@ from osfcore.render.types import SceneBatch
 from osfcore.world.scenes import Conditions
 from osfcore.world.tasks import Draw, draw_scene
 
-REPORT_FILE, CHART_FILE, IMAGES_FILE = "relighting.json", "relighting.png", "relighting_scene.png"
+REPORT_FILE, CHART_FILE, IMAGES_FILE = "relighting.json", "relighting.svg", "relighting_scene.png"
 ELEVATIONS_DEG = (5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 75.0, 90.0)
 ALL, SKY = "all", "sky"  # the span of all elevations, and that of the whole sky
 _SKY_LIGHTS = 16
@@ -105,12 +106,16 @@ def compare_relighting(
     about = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "size", "factor")}
     spans = {ALL: range(len(elevations)), **{f"{elevation:g}": [n] for n, elevation in enumerate(elevations)}}
     spans |= {SKY: [len(elevations)]} if config.sky else {}
-    places = (*elevations, *([np.nan] if config.sky else []))
     yield from compare(
         config, piece, executor, files=(REPORT_FILE, CHART_FILE, IMAGES_FILE),
         about={**about, "names": list(names), "elevations_deg": list(elevations)}, measures=MEASURES, spans=spans,
-        x=Axis("light above the table [deg]", 0, 90), places=places, picture=_picture,
+        charts=charts_of, picture=_picture,
     )  # fmt: skip
+
+
+def charts_of(report: Mapping[str, Any]) -> list[Chart]:
+    """Draw PSNR and SSIM by elevation of the light from a report of `compare_relighting`."""
+    return image_charts(report, Axis("light above the table [deg]", 0, 90), report["elevations_deg"])
 
 
 def show_relit(

@@ -43,7 +43,7 @@ from osfcore.render.types import SceneBatch
 from osfcore.world.tasks import draw_scene, opened
 
 METHODS = ("ours", "paper")
-REPORT_FILE, CHART_FILE, IMAGES_FILE = "unrolled.json", "unrolled.png", "unrolled_scene.png"
+REPORT_FILE, CHART_FILE, IMAGES_FILE = "unrolled.json", "unrolled.svg", "unrolled_scene.png"
 VERSION = 1  # raised by hand when figures may change
 MOMENTS = ("first step", "light overhead", "light moves", "halfway", "end")
 _KEYS = {"mm": "mean position error [mm]", "deg": "mean rotation error [deg]", "light_deg": "error of the light [deg]"}
@@ -96,15 +96,20 @@ def unrolled_estimates(
     report: dict[str, Any] = {key: getattr(config, key) for key in ("tasks", "seed", "objects", "size")}
     report["names"] = list(config.names or ())
     report["methods"] = {method: summary([one.figures for one in part]) for method, part in results.items()}
+    write_charts(config.folder / CHART_FILE, charts_of(report))
+    write_json(config.folder / REPORT_FILE, report)
+    write_png(config.folder / IMAGES_FILE, _picture({method: part[0] for method, part in results.items()}))
+    yield EvaluationStep(len(pieces), len(pieces), "Everything is measured", report)
+
+
+def charts_of(report: Mapping[str, Any]) -> list[Chart]:
+    """Draw each error along the estimate, a curve for each method, from a report of `unrolled_estimates`."""
     charts = []
     for key, label in _KEYS.items():
         rows = {method: figures["along"][key] for method, figures in report["methods"].items()}
         curves = [Curve(TITLES[m], np.linspace(0, 100, len(row)), np.array(row, float)) for m, row in rows.items()]
         charts.append(Chart("", Axis("share of all steps [%]", 0, 100), Axis(label, 0), curves))
-    write_charts(config.folder / CHART_FILE, charts)
-    write_json(config.folder / REPORT_FILE, report)
-    write_png(config.folder / IMAGES_FILE, _picture({method: part[0] for method, part in results.items()}))
-    yield EvaluationStep(len(pieces), len(pieces), "Everything is measured", report)
+    return charts
 
 
 def _estimated(

@@ -19,11 +19,11 @@ from jaxtyping import Float, UInt8
 from osfcore.control.estimators import Estimators, SceneModels, load_scene_models
 from osfcore.dynamics.rollout import network_path
 from osfcore.errors import InvalidInput
-from osfcore.experiments.charts import Axis
+from osfcore.experiments.charts import Axis, Chart
 from osfcore.experiments.estimation_tasks import episode, first_frame, take_frame
 from osfcore.experiments.fields import SCENE_QUALITY
 from osfcore.experiments.harness import EvaluationStep, Piece, TaskCache, TaskResult, file_sha256
-from osfcore.experiments.images import TITLES, CompareImages, checked, compare, shown_circumstances
+from osfcore.experiments.images import TITLES, CompareImages, checked, compare, image_charts, shown_circumstances
 from osfcore.experiments.rearrangement_runs import Variant, loop_parts
 from osfcore.experiments.rivals.fitvid import fitvid_path, read_fitvid
 from osfcore.fields.field_library import FieldLibrary
@@ -98,7 +98,7 @@ def simulate_video(draw: Draw, library: AssetLibrary, steps: int, size: int) -> 
     return VideoEpisode(np.stack(frames[:2]), pushes.actions[0], look, pushes.actions[1:], np.stack(frames[2:]))
 
 
-REPORT_FILE, CHART_FILE, IMAGES_FILE = "video.json", "video.png", "video_episode.png"
+REPORT_FILE, CHART_FILE, IMAGES_FILE = "video.json", "video.svg", "video_episode.png"
 HORIZONS = (10, 30)  # steps over which means are reported
 VERSION = 1  # raised by hand when figures may change
 
@@ -161,8 +161,14 @@ def compare_videos(
         config, piece, executor, files=(REPORT_FILE, CHART_FILE, IMAGES_FILE), about={**about, "names": list(names)},
         measures=MEASURES,
         spans={str(horizon): range(horizon) for horizon in sorted({min(h, config.steps) for h in HORIZONS})},
-        x=Axis("predicted steps of 0.2 s", 0, config.steps), places=range(1, config.steps + 1), picture=_picture,
+        charts=charts_of, picture=_picture,
     )  # fmt: skip
+
+
+def charts_of(report: Mapping[str, Any]) -> list[Chart]:
+    """Draw PSNR and SSIM by predicted step from a report of `compare_videos`."""
+    steps = report["steps"]
+    return image_charts(report, Axis("predicted steps of 0.2 s", 0, steps), range(1, steps + 1))
 
 
 def measure_video(

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import base64
+import io
+import re
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+from PIL import Image
 
 from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput, check_seed
 from osfcore.experiments import relighting, unrolled_estimation, video_prediction
-from osfcore.experiments.charts import Axis, Bar, Chart, Curve, write_bars, write_charts
+from osfcore.experiments.charts import Axis, Bar, Bars, Chart, Curve, svg
 from osfcore.experiments.dynamics import COUNTS, DynamicsMethod, EvaluateDynamics, evaluate_dynamics
 from osfcore.experiments.factors import EPISODE_FACTORS
 from osfcore.experiments.harness import EvaluationStep, finished
@@ -55,6 +59,7 @@ from osfcore.world.tasks import Family
 SectionName = Literal["methods", "families", "ablations", "ladder", "factors", "attribution"]
 SECTIONS: tuple[SectionName, ...] = get_args(SectionName)
 _LADDER: tuple[StageName, ...] = ("estimation", "dynamics", "planning", "fields")  # the order in which ours come in
+_ORACLE = "told the truth"
 _METHODS = {
     "ours": Variant(),
     "as published": Variant("paper"),
@@ -127,22 +132,24 @@ class Section(NamedTuple):
         title: over it.
         text: on what is compared.
         cells: the first of which all others are compared with.
+        left_out: labels of what has no finished tasks, if only these are shown.
     """
 
     name: SectionName
     title: str
     text: str
     cells: tuple[Cell, ...]
+    left_out: tuple[str, ...] = ()
 
 
-def objects_in_words(count: int) -> str:
-    """Return words such as "1 object"."""
-    return f"{count} object{'s' * (count > 1)}"
+def _counted(count: int, what: str) -> str:
+    """Return words such as "1 object" and "2 objects"."""
+    return f"{count} {what}{'s' * (count > 1)}"
 
 
 def _objects(figures: Mapping[str, Any]) -> str:
     """Return how many objects a cell's tasks have, and how they stand, in words."""
-    return objects_in_words(figures["objects"]) + " that stand upright" * (figures["family"] == "upright")
+    return _counted(figures["objects"], "object") + " that stand upright" * (figures["family"] == "upright")
 
 
 def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...] = SECTIONS) -> tuple[Section, ...]:
@@ -164,9 +171,9 @@ def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...]
     variants |= {f"true {truth}": Variant(truths=frozenset({truth})) for truth in TRUTHS}
     variants["all true"] = Variant(truths=frozenset(TRUTHS))
     attributed = [Cell(label, replace(base, variant=variant)) for label, variant in variants.items()]
-    harder = "Harder goals: turned as well, in one another's places, photographed under another light."
-    differing = "One thing differs from what the method takes for granted, and it is not told."
-    replaced = "Each stage in turn is replaced by the truth: what its errors cost."
+    harder = "Goals are harder: objects are turned as well, change places, or are photographed under another light."
+    differing = "One thing differs from what the method takes for granted, and the method is not told."
+    replaced = "One stage at a time is replaced by the truth. This shows what the errors of that stage cost."
     sections = (
         *_methods(base, scale),
         Section("families", "Families of tasks", harder, tuple(families)),
@@ -176,6 +183,23 @@ def sections_of(base: EvaluateMpc, scale: Scale, chosen: tuple[SectionName, ...]
         Section("attribution", "Where episodes fail", replaced, tuple(attributed)),
     )
     return tuple(section for section in sections if section.name in chosen and len(section.cells) > 1)
+
+
+_METHODS_TEXT = (
+    "Each method pushes until the table looks as in the goal image, or until its actions are used up. All methods get "
+    "the same tasks, with masks in the first frame alone. The paper has 20 tasks for each method. Ours refuses goals "
+    "that it doubts, and then fails. The other methods refuse none: for them, the column counts the goals that our "
+    "doubts would have refused."
+)
+_METHOD_TEXTS = {
+    "as published": "“As published” is this project's re-implementation of the paper. The paper's own evaluation gives "
+    "masks at every step, as a row of the ablations has them.",
+    "compositional NeRF": "NeRFs take the place of the fields in our loop.",
+    "visual foresight": "Visual foresight has a FitVid of 4.0 million parameters, told where the pusher is, which "
+    "learned for 50 minutes on one core. This says little of the original with its 302 million.",
+    "light overhead": "“Light overhead” is our loop without an estimate of the light.",
+    "light known": "“Light known” is our loop, told the true light.",
+}
 
 
 def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
@@ -190,16 +214,8 @@ def _methods(base: EvaluateMpc, scale: Scale) -> list[Section]:
             for label, variant in _METHODS.items()
             if scale.has_slow_cells or variant.method != "overhead"
         ]
-        title = f"Success by threshold, {_objects({'objects': count, 'family': family})} (Fig. 7)"
-        text = (
-            "Closed loops toward a goal image. All methods get the same tasks, and masks in the first frame alone, "
-            "also the one as published, whose own evaluation has them at every step (below, under ablations). "
-            "Compositional NeRFs and the two lights take the place of our fields and our estimate of the light in our "
-            "loop. Ours refuses goals that it doubts, and fails there; others refuse none: what our doubts would have "
-            "refused is counted beside them. Visual foresight has a FitVid of 4.0 million parameters, told where the "
-            "pusher is, which learned for 50 minutes on one core; this says little of the original's 302 million."
-        )
-        sections.append(Section("methods", title, text, tuple(cells)))
+        title = f"Success with {_objects({'objects': count, 'family': family})} (Fig. 7)"
+        sections.append(Section("methods", title, _METHODS_TEXT, tuple(cells)))
     return sections
 
 
@@ -218,7 +234,7 @@ def _ablations(base: EvaluateMpc, scale: Scale) -> Section:
     cells.append(Cell("as published, masks at every step", replace(base, variant=Variant("paper", has_masks=True))))
     text = (
         f"Ours has four views, K = {plan.samples} sequences of T = {plan.horizon} actions and a cost of poses. "
-        "Masks are given in the first frame alone, but for the last row: the paper's evaluation has them at every step."
+        "Masks are given in the first frame alone. In the last row they are given at every step, as in the paper."
     )
     return Section("ablations", "Ablations", text, tuple(cells))
 
@@ -230,8 +246,42 @@ def _ladder(base: EvaluateMpc, scale: Scale) -> Section:
         cells.append(Cell(f"+ our {_LADDER[count - 1]}", replace(base, variant=variant)))
     last = _LADDER[len(cells) - 1 :]
     cells.append(Cell(f"+ our {' and '.join(last)} = ours", base))
-    text = "From the method as published to ours, one stage after another; each row keeps what those above it changed."
+    text = "From the published method to ours, one stage at a time. Each row keeps the changes of the rows above it."
     return Section("ladder", "The ladder", text, tuple(cells))
+
+
+def only_finished(sections: Sequence[Section], fields: FieldLibrary, assets: AssetLibrary) -> tuple[Section, ...]:
+    """Return sections with the tasks that need not be run any more.
+
+    A cell has its tasks up to the first that is missing, so that none is left out because it takes long. Cells without
+    any are left out, and so are sections without their first cell or without another one.
+
+    Args:
+        sections: what was to be measured.
+        fields: of the objects.
+        assets: meshes for the simulator.
+
+    Raises:
+        UnknownName, MissingAssets, InvalidInput: as `evaluate_mpc` does.
+    """
+    found = []
+    for section in sections:
+        all_cells = [Cell(label, _up_to_missing(config, fields, assets)) for label, config in section.cells]
+        cells = [cell for cell in all_cells if cell.config.tasks > 0]
+        if len(cells) > 1 and cells[0] is all_cells[0]:
+            left_out = [cell.label for cell in all_cells if cell.config.tasks == 0]
+            if section.cells[0].config.oracle > cells[0].config.oracle:
+                left_out.append(_ORACLE)
+            found.append(section._replace(cells=tuple(cells), left_out=tuple(left_out)))
+    return tuple(found)
+
+
+def _up_to_missing(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibrary) -> EvaluateMpc:
+    """Return a cell with its tasks up to the first that is missing, and with the oracle if it has them as well."""
+    is_done = [piece.is_done() for piece in episode_pieces(checked(config, fields, assets), fields, assets)]
+    tasks = len(list(takewhile(bool, is_done[: config.tasks])))
+    has_oracle = config.oracle and all(is_done[config.tasks : config.tasks + tasks])
+    return replace(config, tasks=tasks, oracle=has_oracle)
 
 
 # Measuring the cells of a report side by side, and what their results say next to each other.
@@ -246,7 +296,8 @@ class MeasuredCell(NamedTuple):
         label: in tables and charts.
         report: all results.
         figures: of the report, as plain JSON.
-        against: comparison with the section's first cell, task by task; None for that cell itself and for other tasks.
+        against: comparison with the section's first cell in the "tasks" that both have, one by one; None for that cell
+            itself and for other tasks.
     """
 
     label: str
@@ -294,21 +345,31 @@ def measure_cells(
             report = episodes_report(config, [found[piece.cache.folder, piece.name] for piece in parts])
             against = None
             if cells and _tasks_of(section.cells[0].config) == _tasks_of(config):
-                against = paired(report.shipped, cells[0].report.shipped)
+                both = min(len(report.shipped), len(cells[0].report.shipped))
+                against = {"tasks": both, **paired(report.shipped[:both], cells[0].report.shipped[:both])}
             cells.append(MeasuredCell(label, report, figures_of(config, report), against))
         measured.append(MeasuredSection(section, tuple(cells)))
     return measured
 
 
-def _tasks_of(config: EvaluateMpc) -> tuple[str, int, int]:
+def _tasks_of(config: EvaluateMpc) -> tuple[str, int]:
     """Return what a cell's tasks depend on: families differ in them, but for the light of the goal image."""
-    return config.family.replace("relit", "shifted"), config.objects, config.tasks
+    return config.family.replace("relit", "shifted"), config.objects
 
 
-# The report as one HTML file that needs nothing beside it.
+# The report as one HTML file that needs nothing beside it, and as Markdown for a site of documents.
 
 
-_TEMPLATE = "page.html.jinja"
+_TEMPLATES = {"report.html": "page.html.jinja", "report.md": "page.md.jinja"}
+_PICTURE_PX, _PICTURE_QUALITY = 840, 70
+_NOTES = (
+    "Intervals are of 95 %: Wilson's for shares, Newcombe's for differences between shares, and a bootstrap over tasks "
+    "for means.",
+    "p is McNemar's exact test of the tasks that both methods have. In the findings it is corrected by Holm for all "
+    "comparisons.",
+    "A refused goal counts as a failure, for nothing is moved.",
+    "6D distances are means, with symmetries counted. Errors of the first frame are medians.",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,7 +396,8 @@ class PagePart(NamedTuple):
 
     Attributes:
         title: over it.
-        text: under the title.
+        text: under the title, a paragraph a line.
+        charts: side by side, where there is room.
         pictures: PNGs with what they show, in words.
         heads: of the table's columns.
         rows: of the table, words as they stand there.
@@ -343,18 +405,19 @@ class PagePart(NamedTuple):
 
     title: str
     text: str
+    charts: Sequence[Chart | Bars]
     pictures: Sequence[tuple[Path, str]]
     heads: Sequence[str]
     rows: Sequence[Sequence[str]]
 
 
-def write_page(
-    path: Path, about: About, warnings: Sequence[str], findings: Sequence[str], parts: Sequence[PagePart]
+def write_pages(
+    folder: Path, about: About, warnings: Sequence[str], findings: Sequence[str], parts: Sequence[PagePart]
 ) -> None:
-    """Write the report; its pictures become part of it.
+    """Write the report; its charts and pictures become part of it.
 
     Args:
-        path: of the HTML file.
+        folder: for report.html and report.md.
         about: circumstances of the report.
         warnings: what a reader must know first.
         findings: in sentences.
@@ -362,16 +425,36 @@ def write_page(
 
     Raises:
         CannotWrite: if the disk refuses.
-        MissingExtra: if jinja2 is not installed.
+        MissingExtra: if jinja2 or matplotlib is not installed.
     """
     need("experiments", "The report")
     import jinja2
+    from markupsafe import Markup
 
-    template = (files("osfcore.experiments.reproduction") / _TEMPLATE).read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
-    given = {"about": about, "warnings": warnings, "findings": findings, "parts": parts}
-    given["data_url"] = lambda picture: f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"
-    write_atomically(path, environment.from_string(template).render(given).encode())
+    given = {"about": about, "warnings": warnings, "findings": findings, "parts": parts, "picture": _data_url}
+    given |= {"notes": _NOTES, "svg": lambda chart: Markup(svg([chart])), "plain": Markup}
+    for name, template in _TEMPLATES.items():
+        is_html = name.endswith(".html")
+        environment = jinja2.Environment(
+            autoescape=is_html, trim_blocks=True, undefined=jinja2.StrictUndefined,
+            finalize=None if is_html else _as_markdown,
+        )  # fmt: skip
+        source = (files("osfcore.experiments.reproduction") / template).read_text(encoding="utf-8")
+        write_atomically(folder / name, environment.from_string(source).render(given).encode())
+
+
+def _as_markdown(value: object) -> object:
+    """Return plain text so that Markdown shows it as it is; what is HTML already stays."""
+    return value if hasattr(value, "__html__") else re.sub(r"([\\`*_\[\]<>#|$&])", r"\\\1", str(value))
+
+
+def _data_url(path: Path) -> str:
+    """Return a picture as small as a page needs it."""
+    data = io.BytesIO()
+    with Image.open(path) as picture:
+        picture.thumbnail((_PICTURE_PX, picture.height))
+        picture.save(data, "WEBP", quality=_PICTURE_QUALITY, method=6)
+    return f"data:image/webp;base64,{base64.b64encode(data.getvalue()).decode()}"
 
 
 # Charts of a report's sections.
@@ -387,7 +470,7 @@ def _success_chart(section: MeasuredSection) -> Chart:
     first = section.cells[0]
     kinds = {cell.label: cell.report.shipped for cell in section.cells} | {"no action": first.report.nothing}
     if first.report.oracle:
-        kinds["told the truth"] = first.report.told_truth
+        kinds[_ORACLE] = first.report.told_truth
     curves = [_curve(name, scores) for name, scores in kinds.items()]
     return Chart(_objects(first.figures), _DISTANCE, _SHARE, curves)
 
@@ -407,23 +490,20 @@ def _curve(name: str, scores: Sequence[RearrangementScore]) -> Curve:
 _COMPARED = {"success_tight": "within 2 cm and 0.1 rad", "success_2cm": "within 2 cm"}
 _SIGNIFICANT = 0.05
 MOST_LOST = 0.15  # of success, that one factor of variation may cost
-_HALF = 0.5
 
 
 def findings(sections: Sequence[MeasuredSection]) -> list[str]:
     """Return a sentence for each comparison of the methods, for the mean distance, and for what costs too much."""
     methods = [section for section in sections if section.section.name == "methods"]
-    comparisons = [
-        (section.cells[0], cell, key) for section in methods for cell in section.cells[1:] for key in _COMPARED
-    ]
-    corrected = holm([_gap(cell, key)["p"] for _, cell, key in comparisons])
-    sentences = [_method(*one, p) for one, p in zip(comparisons, corrected, strict=True)]
+    pairs = [(section.cells[0], cell) for section in methods for cell in section.cells[1:]]
+    corrected = iter(holm([_gap(cell, key)["p"] for _, cell in pairs for key in _COMPARED]))
+    sentences = [_method(*pair, {key: next(corrected) for key in _COMPARED}) for pair in pairs]
     for section in methods:
         ours = section.cells[0]
         mean, nothing = (ours.figures[f"{who}pose6d_symmetric_mean"] for who in ("", "noaction_"))
         sentences.append(
-            f"{_objects(ours.figures)}: mean 6D pose distance, symmetries counted, {mean:.3f}; doing nothing "
-            f"{nothing:.3f}: {'at most' if mean <= _HALF * nothing else 'more than'} half."
+            f"{_objects(ours.figures)}: tables of ours end at a 6D distance of {mean:.3f} in the mean, and at "
+            f"{nothing:.3f} if nothing is done."
         )
     for cell in (cell for section in sections if section.section.name == "factors" for cell in section.cells[1:]):
         lost, low, high = _lead(cell, "success_tight")
@@ -435,7 +515,7 @@ def findings(sections: Sequence[MeasuredSection]) -> list[str]:
     return sentences
 
 
-def _gap(cell: MeasuredCell, key: str) -> Mapping[str, Any]:
+def _gap(cell: MeasuredCell, key: str) -> Any:  # noqa: ANN401 - a number, or a comparison
     """Return how a cell differs from the first of its section; all methods and all factors have the same tasks."""
     return (cell.against or {})[key]
 
@@ -447,21 +527,21 @@ def _lead(cell: MeasuredCell, key: str) -> tuple[float, float, float]:
     return 100 * (0.0 - gap["difference"]), low, high  # never -0
 
 
-def _method(ours: MeasuredCell, other: MeasuredCell, key: str, corrected: float) -> str:
-    """Compare ours with another method; who is better is said where p, corrected for all comparisons, is below 5 %."""
-    lead, low, high = _lead(other, key)
-    better = "ours is better" if lead > 0 else "ours is worse"
-    verdict = better if corrected < _SIGNIFICANT else "no difference is shown"
-    return (
-        f"{_objects(ours.figures)}, ours and {other.label}, {_COMPARED[key]}: {100 * ours.figures[key]:.0f} % against "
-        f"{100 * other.figures[key]:.0f} %, which is {lead:+.0f} points (95 %: {low:+.0f} to {high:+.0f}; "
-        f"McNemar p = {_gap(other, key)['p']:.2g}, {corrected:.2g} by Holm for all these comparisons): {verdict}."
-    )
+def _method(ours: MeasuredCell, other: MeasuredCell, corrected: Mapping[str, float]) -> str:
+    """Compare ours with another method; one is called better where p, corrected for all comparisons, is below 5 %."""
+    tasks = _counted(_gap(other, "tasks"), "task")
+    sentences = [f"{_objects(ours.figures)}, ours and {other.label}, {tasks}."]
+    for key, p in corrected.items():
+        lead, low, high = _lead(other, key)
+        verdict = f"ours is {'better' if lead > 0 else 'worse'}" if p < _SIGNIFICANT else "no difference is shown"
+        about = f"{lead:+.0f} points, 95 %: {low:+.0f} to {high:+.0f}, p = {p:.2g}"
+        sentences.append(f"{_COMPARED[key].capitalize()}, {verdict} ({about}).")
+    return " ".join(sentences)
 
 
 _HEADS = (
-    "", "tasks", "2 cm and 0.1 rad", "2 cm", "refused", "6D mean", "with symmetry", "its median", "first frame [mm]",
-    "[deg]", "light [deg]", "points against the first row",
+    "", "tasks", "2 cm and 0.1 rad", "2 cm", "refused", "6D distance", "first frame", "light",
+    "points more than the first row",
 )  # fmt: skip
 
 
@@ -470,7 +550,7 @@ def rows_of(section: MeasuredSection) -> list[list[str]]:
     rows = [_row(cell.label, cell.figures, "", cell) for cell in section.cells]
     first = section.cells[0]
     if first.report.oracle:
-        rows.append(_row("told the truth", first.figures, "oracle_"))
+        rows.append(_row(_ORACLE, first.figures, "oracle_"))
     rows.append(_row("no action", first.figures, "noaction_"))
     return rows
 
@@ -480,21 +560,23 @@ def _row(label: str, figures: Mapping[str, Any], who: str, cell: MeasuredCell | 
     for key in _COMPARED:
         low, high = figures[f"{who}{key}_interval"]
         shares.append(f"{100 * figures[who + key]:.0f} % ({100 * low:.0f} to {100 * high:.0f})")
-    distances = ("pose6d_mean", "pose6d_symmetric_mean", "pose6d_symmetric_median")
-    refused, errors, gap = "", ["", "", ""], ""
+    refused, errors, gap = "", ["", ""], ""
     if cell is not None:
         refused = str(figures["refused"])
-        medians = [figures[f"{key}_median"] for key in ("first_mm", "first_deg", "light_deg")]
-        errors = ["" if value is None else f"{value:.2f}" for value in medians]
+        mm, deg, light = (figures[f"{key}_median"] for key in ("first_mm", "first_deg", "light_deg"))
+        errors = ["" if mm is None else f"{mm:.1f} mm, {deg:.1f}°", "" if light is None else f"{light:.1f}°"]
         if cell.against is not None:
             ahead = cell.against["success_tight"]
             low, high = ahead["interval"]
             gap = f"{100 * ahead['difference']:+.0f} ({100 * low:+.0f} to {100 * high:+.0f}), p = {ahead['p']:.2g}"
-    six_d = [f"{figures[who + key]:.3f}" for key in distances]
-    return [label, str(figures["tasks"]), *shares, refused, *six_d, *errors, gap]
+    distance = f"{figures[f'{who}pose6d_symmetric_mean']:.3f}"
+    return [label, str(figures["tasks"]), *shares, refused, distance, *errors, gap]
 
 
 # The parts of a report before the episodes, each of one evaluation.
+
+
+_HORIZONS = (1, 4, 10, 30)  # actions after which predicted poses are compared
 
 
 def estimation_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
@@ -511,46 +593,44 @@ def estimation_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
             values = [figures["moments"][key][n] for key in titles]
             rows.append([TITLES[method], moment, *("-" if value is None else f"{value:.3g}" for value in values)])
     text = (
-        f"First frames of {objects_in_words(report['objects'])}: {report['tasks']}, medians. The published estimation "
-        "holds the light overhead for its first five iterations; ours reads it off the table's shadows early on. The "
-        "green cube is where the light is taken to be, the white frame where it is."
+        f"Medians of the errors of {_counted(report['tasks'], 'first frame')} with "
+        f"{_counted(report['objects'], 'object')}. The published estimation holds the light overhead for its first "
+        "five iterations. Ours reads the light from the shadows on the table early on. In the pictures, the green cube "
+        "is where the light is taken to be, and the white frame is where it is."
     )
-    pictures = (
-        (
-            folder / unrolled_estimation.IMAGES_FILE,
-            "One frame at five moments of its estimate, near and far, by each method",
-        ),
-        (folder / unrolled_estimation.CHART_FILE, "Errors of positions, rotations and light along the estimate"),
-    )
-    return PagePart("An estimate as it runs (Figs. 2 and 3)", text, pictures, ("", "moment", *titles.values()), rows)
+    picture = folder / unrolled_estimation.IMAGES_FILE
+    pictures = [(picture, "One frame at five moments of its estimate, near and far, by each method")]
+    charts = unrolled_estimation.charts_of(report)
+    heads = ("", "moment", *titles.values())
+    return PagePart("An estimate as it runs (Figs. 2 and 3)", text, charts, pictures, heads, rows)
 
 
-def dynamics_part(folder: Path, reports: Mapping[str, Mapping[str, Any]]) -> PagePart:
+def dynamics_part(_folder: Path, reports: Mapping[str, Mapping[str, Any]]) -> PagePart:
     """Return the part on predicted poses.
 
     Args:
-        folder: with the pictures.
+        _folder: of the evaluation, of which no file is shown.
         reports: of `evaluate_dynamics`, by method.
     """
-    horizons = (4, 10, 30)
-    heads = [f"{horizon} steps [{unit}]" for horizon in horizons for unit in ("mm", "deg")]
-    rows = []
-    for method, report in reports.items():
-        cells = [report[f"median_{unit}_{horizon}"] for horizon in horizons for unit in ("mm", "deg")]
-        rows.append([TITLES[method], *("-" if cell is None else f"{cell:.3g}" for cell in cells)])
     still = next(iter(reports.values()))
-    cells = [still[f"constant_{unit}_{horizon}"] for horizon in horizons for unit in ("mm", "deg")]
-    rows.append(["no motion", *("-" if cell is None else f"{cell:.3g}" for cell in cells)])
+    predicted = {TITLES[method]: (report, "median") for method, report in reports.items()}
+    predicted |= {"quasi-static": (still, "analytic"), "no motion": (still, "constant")}
+    heads = [f"{_counted(horizon, 'action')} [{unit}]" for horizon in _HORIZONS for unit in ("mm", "deg")]
+    rows = []
+    for title, (report, key) in predicted.items():
+        cells = [report[f"{key}_{unit}_{horizon}"] for horizon in _HORIZONS for unit in ("mm", "deg")]
+        rows.append([title, *("-" if cell is None else f"{cell:.3g}" for cell in cells)])
+    charts, x = [], np.array(_HORIZONS, float)
+    for unit, label in {"mm": "median position error [mm]", "deg": "median rotation error [deg]"}.items():
+        values = {t: [one[f"{key}_{unit}_{h}"] for h in _HORIZONS] for t, (one, key) in predicted.items()}
+        curves = [Curve(title, x, np.array(y, float), dots=True) for title, y in values.items()]
+        charts.append(Chart("", Axis("actions of 0.2 s", 0, _HORIZONS[-1]), Axis(label, 0), curves))
     text = (
-        f"Medians over objects that moved, {still['windows']} within four actions, in episodes that no network learned "
-        "from and that chose nothing: half of them seek contact, half are the paper's random ones. True poses and "
-        "actions are given."
+        f"Medians over the objects that moved, {still['windows']} of them within four actions. No network learned from "
+        "these episodes, and they chose nothing. Half of them seek contact, and half are the paper's random ones. "
+        "True poses and actions are given. The quasi-static model is an analytic one without learning."
     )
-    pictures = [
-        (folder / ("" if method == "ours" else method) / "dynamics.png", f"Errors by horizon, {TITLES[method]}")
-        for method in reports
-    ]
-    return PagePart("Predicted poses (sec. 4.3)", text, pictures, ("", *heads), rows)
+    return PagePart("Predicted poses (Sec. 4.3)", text, charts, [], ("", *heads), rows)
 
 
 def photos_part(folder: Path, reports: Mapping[str, Mapping[str, Any]]) -> PagePart:
@@ -561,22 +641,25 @@ def photos_part(folder: Path, reports: Mapping[str, Mapping[str, Any]]) -> PageP
         reports: of `evaluate_photos`, by what searches begin with.
     """
     heads = ("starts", "photograph", "object", "IoU", "position [mm]", "rotation [deg]", "doubted")
-    rows, pictures = [], []
+    rows = []
     for start, report in reports.items():
         for score in report["scores"]:
             errors = ("-" if score[key] is None else f"{score[key]:.1f}" for key in ("position_mm", "rotation_deg"))
             about = "yes" if score["doubt"] else ""
             rows.append([start, score["scene"], score["name"], f"{score['iou']:.3f}", *errors, about])
-        sheets = sorted((folder / start).glob("*.png"))
-        pictures += [(sheet, f"{sheet.stem}: photograph, pose, difference; starts {start}") for sheet in sheets]
+    # All starts give much the same pictures; those of the last are of the paper's start, if there are any.
+    *_, shown = reports
+    sheets = sorted((folder / shown).glob("*.png"))
+    pictures = [(sheet, f"{sheet.stem}: photograph, outline of the pose found, object as rendered") for sheet in sheets]
     lamps = {name: errors for report in reports.values() for name, errors in report["light_deg"].items()}
     rows += [["", name, "lamp", "", "", f"{np.median(errors):.1f}", ""] for name, errors in lamps.items()]
     text = (
-        "Objects in real photographs, given their masks, from no start and from every other source of poses there is. "
-        "Errors are from the truth where it is known, else from poses that were refined with measured depth. Lamps: "
-        "median angle between estimated and true direction."
+        "Objects in real photographs, given their masks. Searches begin without a start, or with poses of another "
+        f"program; pictures are of the start “{shown}”. Errors are from the true poses where these are known, and else "
+        "from poses refined with measured depth. For lamps, the error is the median angle between the estimated and "
+        "the true direction."
     )
-    return PagePart("Real photographs (Fig. 8)", text, pictures, heads, rows)
+    return PagePart("Real photographs (Fig. 8)", text, [], pictures, heads, rows)
 
 
 def relighting_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
@@ -589,14 +672,13 @@ def relighting_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
     titles = {"psnr": "PSNR [dB]", "ssim": "SSIM", "psnr_object": "on objects [dB]", "psnr_shadow": "in shadow [dB]"}
     columns = [(key, relighting.ALL, title) for key, title in titles.items()]
     text = (
-        f"{report['tasks']} scenes of {objects_in_words(report['objects'])}, poses and light given, under lights "
-        f"between {min(report['elevations_deg']):g} and {max(report['elevations_deg']):g} deg above the table."
+        f"{_counted(report['tasks'], 'scene')} with {_counted(report['objects'], 'object')}, under lights between "
+        f"{min(report['elevations_deg']):g} and {max(report['elevations_deg']):g} deg above the table. Poses and light "
+        "are given."
     )
-    pictures = (
-        (folder / relighting.CHART_FILE, "PSNR and SSIM by elevation of the light"),
-        (folder / relighting.IMAGES_FILE, "One scene under a low, a middle and a high light, by each method"),
-    )
-    return PagePart("Scenes under any light (Fig. 5)", text, pictures, *_table(report, columns))
+    pictures = [(folder / relighting.IMAGES_FILE, "One scene under a low, a middle and a high light, by each method")]
+    charts, table = relighting.charts_of(report), _table(report, columns)
+    return PagePart("Scenes under any light (Fig. 5)", text, charts, pictures, *table)
 
 
 def video_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
@@ -609,14 +691,13 @@ def video_part(folder: Path, report: Mapping[str, Any]) -> PagePart:
     spans, titles = next(iter(report["methods"].values()))["psnr"]["spans"], {"psnr": "PSNR [dB]", "ssim": "SSIM"}
     columns = [(key, span, f"{title}, {span} steps") for span in spans for key, title in titles.items()]
     text = (
-        f"{report['tasks']} episodes of {objects_in_words(report['objects'])}, {report['steps']} actions known "
-        "in advance, from the first frame's estimate; FitVid sees two frames of the goal camera."
+        f"{_counted(report['tasks'], 'episode')} with {_counted(report['objects'], 'object')} and "
+        f"{_counted(report['steps'], 'action')} that are known in advance. Predictions begin with the estimate of the "
+        "first frame. FitVid sees two frames of the goal camera instead."
     )
-    pictures = (
-        (folder / video_prediction.CHART_FILE, "PSNR and SSIM by predicted step"),
-        (folder / video_prediction.IMAGES_FILE, "One episode as it was and as each method predicts it"),
-    )
-    return PagePart("Predicted futures as images (Fig. 6)", text, pictures, *_table(report, columns))
+    pictures = [(folder / video_prediction.IMAGES_FILE, "One episode as it was and as each method predicts it")]
+    charts, table = video_prediction.charts_of(report), _table(report, columns)
+    return PagePart("Predicted futures as images (Fig. 6)", text, charts, pictures, *table)
 
 
 def _table(
@@ -647,8 +728,8 @@ def _interval(figure: Mapping[str, Any], what: str) -> str:
 # from a quick one, whose episodes are shorter.
 
 
-PAGE_FILE, FIGURES_FILE = "report.html", "reproduction.json"
-_CURVES = "success.png"
+PAGE_FILE, MARKDOWN_FILE = _TEMPLATES
+FIGURES_FILE = "reproduction.json"
 EvaluationName = Literal["estimation", "relighting", "dynamics", "video", "photos"]
 EVALUATIONS: tuple[EvaluationName, ...] = get_args(EvaluationName)
 PartName = EvaluationName | SectionName
@@ -667,7 +748,7 @@ class Reproduce:
     """What to measure and to report.
 
     Attributes:
-        folder: for report.html, reproduction.json, pictures, and all results.
+        folder: for report.html, report.md, reproduction.json, pictures, and all results.
         data_dir: where objects, fields and networks of this machine are.
         about: circumstances, as the page shows them; the names are filled in.
         scale: how much is measured.
@@ -675,6 +756,7 @@ class Reproduce:
         parts: of the report.
         names: objects to draw from; those that all methods have a field of if None.
         photos: folder of photographs as `evaluate_photos` takes them; without one their part is left out.
+        is_finished: whether no more episodes are run: cells show those that are there.
     """
 
     folder: Path
@@ -685,6 +767,7 @@ class Reproduce:
     parts: tuple[PartName, ...] = PARTS
     names: tuple[str, ...] | None = None
     photos: Path | None = None
+    is_finished: bool = False
 
 
 def reproduce(config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, executor: Executor | None = None) -> Steps:
@@ -698,7 +781,7 @@ def reproduce(config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, exe
 
     Raises:
         UnknownName, MissingAssets: if an object lacks a field or a mesh.
-        InvalidInput: if a number or name is out of range.
+        InvalidInput: if a number or name is out of range, or only finished episodes are wanted and there are none.
         MissingExtra: if what writes pages or draws charts is not installed.
         NoRoom, WorkerDied, CorruptFile, CannotWrite: as for evaluations.
     """
@@ -717,13 +800,21 @@ def reproduce(config: Reproduce, fields: FieldLibrary, assets: AssetLibrary, exe
             images[part] = yield from evaluation
     base = EvaluateMpc(config.folder, config.data_dir, seed=config.about.seed, names=names)
     chosen: tuple[SectionName, ...] = tuple(name for name in SECTIONS if name in config.parts)
-    measured = yield from measure_cells(sections_of(base, config.scale, chosen), fields, assets, executor)
+    sections = asked = sections_of(base, config.scale, chosen)
+    if config.is_finished:
+        sections = only_finished(asked, fields, assets)
+        if not (sections or images):
+            allowed = "one with tasks of two methods or more, of the same seed, objects and number of actions"
+            raise InvalidInput("folder of finished episodes", config.folder, allowed)
+    measured = yield from measure_cells(sections, fields, assets, executor)
     report = _figures(config, images, measured)
     write_json(config.folder / FIGURES_FILE, report)
     places = {"dynamics": config.folder / "dynamics", "photos": config.folder / "photos"}
     parts = [_EVALUATION_PARTS[name](places.get(name, config.folder), figures) for name, figures in images.items()]
-    parts += _section_parts(config.folder, measured)
-    write_page(config.folder / PAGE_FILE, config.about, _warnings(config), report["findings"], parts)
+    parts += _section_parts(measured)
+    titles = {section.title for section in sections}
+    warnings = _warnings(config, [section.title for section in asked if section.title not in titles])
+    write_pages(config.folder, config.about, warnings, report["findings"], parts)
     yield EvaluationStep(1, 1, "The report is written", report)
 
 
@@ -782,35 +873,47 @@ def _figures(
     return {**about, **dict(images), "findings": findings(measured), "sections": sections}
 
 
-def _warnings(config: Reproduce) -> list[str]:
-    """Return what a reader must know before anything else."""
+def _warnings(config: Reproduce, unfinished: Sequence[str]) -> list[str]:
+    """Return what a reader must know before anything else.
+
+    Args:
+        config: what was asked for.
+        unfinished: titles of sections that are left out.
+    """
     scale, warnings = config.scale, list[str]()
     if config.is_quick:
         warnings.append(
-            f"A quick look and no measurement: {scale.tasks} tasks a cell, {scale.settings.steps} actions instead of "
-            f"30, plans of {scale.settings.plan.samples} sequences, {objects_in_words(scale.objects)}, "
-            f"and only the factor {', '.join(scale.factors)}. Cells that take "
-            "longest are left out. Intervals are as wide as that makes them."
+            f"A quick look and no measurement: {_counted(scale.tasks, 'task')} a cell, "
+            f"{_counted(scale.settings.steps, 'action')} instead of 30, plans of {scale.settings.plan.samples} "
+            f"sequences, {_counted(scale.objects, 'object')}, and only the factor {', '.join(scale.factors)}. The "
+            "slowest cells are left out, and intervals are wide."
         )
     left_out = [part for part in PARTS if part not in config.parts or (part == "photos" and config.photos is None)]
     if left_out:
         warnings.append(f"Parts left out: {', '.join(left_out)}.")
+    if config.is_finished:
+        warnings.append("Each row has as many tasks as are finished, and says how many.")
+    if unfinished:
+        warnings.append(f"Sections left out, with too few finished tasks: {'; '.join(unfinished)}.")
     return warnings
 
 
-def _section_parts(folder: Path, measured: Sequence[MeasuredSection]) -> list[PagePart]:
+def _section_parts(measured: Sequence[MeasuredSection]) -> list[PagePart]:
     methods = [section for section in measured if section.section.name == "methods"]
     parts: list[PagePart] = []
     for section in measured:
-        about, pictures = section.section, list[tuple[Path, str]]()
+        about, text, charts = section.section, section.section.text, list[Chart | Bars]()
         if about.name != "methods":
-            picture, axis = folder / f"{about.name}.png", Axis("share of tasks within 2 cm and 0.1 rad", 0, 1)
             figures = {cell.label: cell.figures for cell in section.cells}
             bars = [Bar(name, f["success_tight"], *f["success_tight_interval"]) for name, f in figures.items()]
-            write_bars(picture, about.title, axis, bars)
-            pictures.append((picture, f"{about.title}: share of tasks within 2 cm and 0.1 rad"))
-        elif section is methods[0]:  # one picture for all numbers of objects
-            write_charts(folder / _CURVES, [_success_chart(one) for one in methods])
-            pictures.append((folder / _CURVES, "Share of tasks within each 6D distance, for each number of objects"))
-        parts.append(PagePart(about.title, about.text, pictures, _HEADS, rows_of(section)))
+            charts.append(Bars("Within 2 cm and 0.1 rad", _SHARE, bars))
+        elif section is methods[0]:  # all charts and texts stand at the first number of objects
+            labels = {cell.label for one in methods for cell in one.cells}
+            text += "\n" + " ".join(words for label, words in _METHOD_TEXTS.items() if label in labels)
+            charts += [_success_chart(one) for one in methods]
+        else:
+            text = "The same methods with other tasks. Their curves stand above."
+        if about.left_out:
+            text += f"\nLeft out, with no finished tasks: {', '.join(about.left_out)}."
+        parts.append(PagePart(about.title, text, charts, [], _HEADS, rows_of(section)))
     return parts

@@ -92,8 +92,8 @@ def test_everything_is_measured_and_reported(evaluated):
     assert result["bad_by_kind"]["wrong name"] == result["bad_by_kind"]["goal of other objects"]
     assert json.loads((config.folder / estimation.REPORT_FILE).read_text()) == result
     assert config.folder == config.out / "estimate" / "2-objects-seed-0"
-    pictures = {path.name for path in config.folder.glob("*.png")}
-    assert pictures == {"errors.png", "calibration.png", "track.png", "views.png", "failures_bad.png"}
+    pictures = {path.name for path in config.folder.glob("*.*g")}
+    assert pictures == {"errors.svg", "calibration.svg", "track.svg", "views.svg", "failures_bad.png"}
     assert [(step.done, step.total) for step in steps] == [(n, 22) for n in range(23)]
     assert [step.report is None for step in steps] == [True] * 22 + [False]
 

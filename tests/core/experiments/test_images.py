@@ -3,7 +3,7 @@ import pytest
 
 from osfcore.errors import InvalidInput, MissingAssets, UnknownName
 from osfcore.experiments.charts import Axis
-from osfcore.experiments.images import FIELD_METHODS, chart_of, common_names, field_path, summary
+from osfcore.experiments.images import FIELD_METHODS, common_names, field_path, image_charts, summary
 from osfcore.fields.field_library import FieldLibrary
 from tests.support.errors import about
 from tests.support.solids import SOLIDS, write_nerfs
@@ -40,13 +40,15 @@ def test_what_was_not_measured_does_not_count():
 
 
 def test_a_chart_begins_below_the_lowest_mean():
-    tables = {"ours": {"psnr": np.array([[31.0, NONE]])}, "fitvid": {"psnr": np.array([[23.0, 27.0]])}}
-    chart = chart_of(tables, "psnr", Axis("step", 0, 2), [1, 2], "PSNR [dB]", 5.0)
-    assert (chart.y.low, chart.y.high) == (20, None)
-    np.testing.assert_array_equal(chart.curves[0].y, [31, NONE])
-    np.testing.assert_array_equal(chart.curves[1].x, [1, 2])
-    empty = chart_of({"ours": {"psnr": np.array([[NONE]])}}, "psnr", Axis("step", 0, 2), [1], "PSNR [dB]", 5.0)
-    assert empty.y.low == 0
+    shown = {"ours": [[31.0, NONE, 9.0]], "fitvid": [[23.0, 27.0, 9.0]]}
+    tables = {method: {"psnr": np.array(rows), "ssim": np.array(rows) / 100} for method, rows in shown.items()}
+    psnr, ssim = image_charts(summary(tables, {}), Axis("step", 0, 2), [1, 2])
+    assert (psnr.y.low, psnr.y.high) == (20, None)
+    assert ssim.y.low == pytest.approx(0.2)
+    np.testing.assert_array_equal(psnr.curves[0].y, [31, NONE])  # the third has no place
+    np.testing.assert_array_equal(psnr.curves[1].x, [1, 2])
+    none = {"ours": {key: np.array([[NONE]]) for key in ("psnr", "ssim")}}
+    assert image_charts(summary(none, {}), Axis("step", 0, 2), [1])[0].y.low == 0
 
 
 # Methods

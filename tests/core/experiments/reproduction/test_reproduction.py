@@ -5,14 +5,16 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import pytest
+from markdown_it import MarkdownIt
 
 from osfcore.control.events import EpisodeSettings
 from osfcore.errors import InvalidInput
 from osfcore.experiments.factors import EPISODE_FACTORS
-from osfcore.experiments.rearrangement import EvaluateMpc
+from osfcore.experiments.rearrangement import EvaluateMpc, evaluate_mpc
 from osfcore.experiments.rearrangement_runs import Variant, check_variant
 from osfcore.experiments.reproduction.reproduction import (
     FIGURES_FILE,
+    MARKDOWN_FILE,
     PAGE_FILE,
     QUICK,
     SECTIONS,
@@ -65,20 +67,69 @@ def test_a_report_holds_all_cells_and_needs_nothing_beside_it(library, tmp_path,
         for cell in section["cells"]:
             assert f"<td>{cell['label']}</td>" in page
             assert cell["figures"]["tasks"] == 2
-    for picture in ("success.png", "factors.png", "attribution.png"):
-        assert (asked.folder / picture).read_bytes().startswith(b"\x89PNG")
-    sources = re.findall(r'(?:src|href)="([^"]*)"', page)
-    assert len(sources) == 3
-    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert page.count("<svg ") == 3
+    assert all(source.startswith("#") for source in re.findall(r'(?:src|href)="([^"]*)"', page))
     assert "told the truth" in page
     assert page.count("<td>no action</td>") == 3
     assert "a &lt;machine&gt;" in page
     assert page.count('class="note"') == 2  # it is quick, and parts are left out
     compared = [line for line in report["findings"] if "ours and" in line]
-    assert len(compared) == 2 * 4  # by both kinds of success
-    assert any("visual foresight" in line and "50 % against 0 %, which is +50 points" in line for line in compared)
-    assert all("no difference is shown" in line for line in compared)  # two tasks cannot show any
-    assert all(line.split(":")[0] in page for line in report["findings"])
+    assert len(compared) == 4
+    (line,) = (line for line in compared if "visual foresight" in line)
+    assert "2 tasks" in line
+    assert line.count("no difference is shown (+50 points") == 2  # two tasks cannot show any; by both kinds of success
+    assert all(line in page for line in report["findings"])
+
+
+@pytest.mark.slow
+def test_a_report_is_also_a_page_for_a_site(library, tmp_path, runs):
+    given = About("today", "a <machine>", "osf reproduce --out my_report", 0, ())
+    asked = config(tmp_path, parts=("attribution",), about=given)
+    reproduced(library, asked)
+    text = (asked.folder / MARKDOWN_FILE).read_text()
+    html = MarkdownIt("commonmark").enable("table").render(text)
+    page = (asked.folder / PAGE_FILE).read_text()
+    tables = [re.findall(r"<td[^>]*>(.*?)</td>", shown) for shown in (page, html)]
+    assert tables[0] == tables[1] != []
+    assert "<h2>Where episodes fail</h2>" in html
+    assert "a &lt;machine&gt;" in html
+    assert "osf reproduce --out my_report\n" in html
+    assert "<em>" not in html
+    (svg,) = re.findall(r"<svg .*?</svg>", html)
+    assert svg in page
+
+
+@pytest.mark.slow
+def test_finished_episodes_are_reported_with_their_number_and_no_others_are_run(library, tmp_path, runs):
+    asked = config(tmp_path, parts=("methods", "factors"), is_finished=True)
+    ours = EvaluateMpc(
+        asked.folder, asked.data_dir, 2, 1, actions=2, names=(NAME,), oracle=False, settings=SMALLEST.settings,
+        foresight=SMALLEST.foresight,
+    )  # fmt: skip
+    for one in (ours, *(replace(ours, tasks=1, variant=Variant(method)) for method in ("nerf", "foresight"))):
+        list(evaluate_mpc(one, FieldLibrary(None), library))
+    runs.clear()
+    (section,) = reproduced(library, asked)[-1].report["sections"]
+    assert {cell["label"]: cell["figures"]["tasks"] for cell in section["cells"]} == {
+        "ours": 2, "compositional NeRF": 1, "visual foresight": 1
+    }  # fmt: skip
+    assert [cell["against_first"]["tasks"] for cell in section["cells"][1:]] == [1, 1]
+    text = (asked.folder / MARKDOWN_FILE).read_text()
+    for words in ("as published, light known, told the truth", "Factors of variation"):
+        (line,) = (line for line in text.splitlines() if words in line)
+        assert "left out" in line.lower()
+
+    def lose(method):
+        (path,) = asked.folder.glob(f"mpc/*/{method}*/0000.json")
+        path.unlink()
+
+    lose("nerf")
+    (section,) = reproduced(library, asked)[-1].report["sections"]
+    assert [cell["label"] for cell in section["cells"]] == ["ours", "visual foresight"]
+    lose("ours")  # without the first task, the second would be a choice of what is fast
+    with pytest.raises(InvalidInput, check=error_about("finished episodes")):
+        reproduced(library, asked)
+    assert runs == []
 
 
 @pytest.mark.slow
@@ -102,7 +153,7 @@ def test_images_are_compared_as_well(library, tmp_path):
     page = (asked.folder / PAGE_FILE).read_text()
     assert list(report["relighting"]["methods"]) == ["ours", "paper", "nerf", "nerf_fitted"]
     assert list(report["video"]["methods"]) == ["copied", "ours", "paper", "nerf", "fitvid"]
-    assert page.count("data:image/png;base64,") == 4
+    assert (page.count("data:image/webp;base64,"), page.count("<svg ")) == (2, 4)
     gap = report["relighting"]["against"]["nerf"]["psnr"]["all"]["difference"]
     assert gap > 3
     assert f">{gap:.3g}<" in page  # of one scene there is no interval
@@ -114,7 +165,7 @@ def test_estimates_and_predicted_poses_are_reported(library, tmp_path):
     names = ("003_cracker_box", NAME, "009_gelatin_box")
     report = reproduced(library, config(tmp_path, parts=("estimation", "dynamics"), scale=few, names=names))[-1].report
     page = (tmp_path / "out" / PAGE_FILE).read_text()
-    assert page.count("data:image/png;base64,") == 4
+    assert (page.count("data:image/webp;base64,"), page.count("<svg ")) == (1, 5)
     for method in ("ours", "paper"):
         assert report["estimation"]["methods"][method]["frames"] == 1
         error = report["dynamics"][method]["median_mm_4"]
