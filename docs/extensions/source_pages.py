@@ -58,11 +58,11 @@ def pages(app: Sphinx) -> Iterator[tuple[str, dict[str, Any], str]]:
     for page, file in sorted(
         {link for of_page in app.env.metadata.values() for link in of_page.get("source_pages", ())}
     ):
-        name = str(Path(file).relative_to(ROOT))
+        path = Path(file).relative_to(ROOT)
         code = app.builder.highlighter.highlight_block(  # pyright: ignore[reportAttributeAccessIssue]
             Path(file).read_text(encoding="utf-8"), "python", linenos="inline", lineanchors="L"
         )
-        yield page, {"title": name, "body": f"<h1>{name}</h1>{code}"}, "page.html"
+        yield page, {"title": path.name, "body": f"<h1>{path.name}</h1><p>{path}</p>{code}"}, "page.html"
 
 
 def setup(app: Sphinx) -> None:
