@@ -10,7 +10,7 @@ from osfcore import CostInputs, EpisodeParts, Rollouts
 
 
 class DistanceAtTheEnd:
-    """How far the objects end from their goals [m]."""
+    """How far the objects end from their goals [m]; rotations do not count."""
 
     def __init__(self, given: CostInputs) -> None:
         """Made anew for each plan; `given.goal` is where the objects should be."""
