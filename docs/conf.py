@@ -22,6 +22,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "command_reference",
     "rest_reference",
+    "source_pages",
 ]
 
 myst_enable_extensions = ["dollarmath"]

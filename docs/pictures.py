@@ -72,6 +72,8 @@ def main(url: str) -> None:
         page.goto(url)
         page.wait_for_selector("#viewer:visible")
         page.wait_for_timeout(15_000)
+        if not page.is_visible("#story-run"):
+            sys.exit("The page shows an episode that runs; take the pictures when it has ended.")
         record(page)
         find_in_photo(page)
         browser.close()

@@ -8,6 +8,7 @@ import numpy as np
 from osfcore import (
     AssetLibrary,
     Episode,
+    EpisodeParts,
     EpisodeSettings,
     FieldLibrary,
     GoalImage,
@@ -21,12 +22,13 @@ from osfcore import (
 NAMES = ("005_tomato_soup_can", "009_gelatin_box")
 
 
-def main(objects: Path, steps: int = 20) -> None:
+def main(objects: Path, steps: int = 20, parts: EpisodeParts | None = None) -> None:
     """One object of two is brought to where a goal image shows it.
 
     Args:
         objects: the folder where `osf assets fetch` has put the objects.
         steps: most pushes.
+        parts: cost, planner and estimators, if others than ours.
     """
     assets, rng = AssetLibrary(objects), np.random.default_rng(0)
     world = Tabletop(assets, request=SceneRequest(names=NAMES))
@@ -37,7 +39,7 @@ def main(objects: Path, steps: int = 20) -> None:
     world.restore(start)
     models = load_scene_models(NAMES, FieldLibrary(None), assets, None)
     settings = EpisodeSettings(steps=steps, despite_doubts=True)
-    for event in Episode(world, models, goal, settings, rng).run():
+    for event in Episode(world, models, goal, settings, rng, parts=parts).run():
         if type(event).__name__ not in ("Looking", "Planning"):
             print(type(event).__name__, getattr(event, "text", ""))
     world.close()

@@ -1,6 +1,7 @@
 """The public names of the core and the modules that define them; `osfcore` loads each when it is first used."""
 
 from .control.closed_loop import Episode as Episode
+from .control.estimators import EpisodeParts as EpisodeParts
 from .control.estimators import SceneModels as SceneModels
 from .control.estimators import load_scene_models as load_scene_models
 from .control.events import EpisodeSettings as EpisodeSettings
@@ -22,6 +23,7 @@ from .geometry.cameras import goal_camera as goal_camera
 from .geometry.light import Light as Light
 from .geometry.poses import Pose as Pose
 from .geometry.poses import rotation_angle as rotation_angle
+from .geometry.rollouts import Rollouts as Rollouts
 from .geometry.states import Observation as Observation
 from .geometry.states import SceneState as SceneState
 from .io.image_file import to_uint8 as to_uint8
@@ -31,6 +33,7 @@ from .objects.asset_library import AssetLibrary as AssetLibrary
 from .planning.costs import PoseCost as PoseCost
 from .planning.costs import PoseGoal as PoseGoal
 from .planning.mppi import MPPIPlanner as MPPIPlanner
+from .planning.parts import CostInputs as CostInputs
 from .planning.pushes import PushProposals as PushProposals
 from .render.renderer import SceneRenderer as SceneRenderer
 from .render.types import Quality as Quality

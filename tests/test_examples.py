@@ -32,8 +32,11 @@ def test_examples_that_need_no_meshes(name, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_episode(library, tmp_path):
-    assert "Finished" in run("episode", tmp_path, str(library.root))
+@pytest.mark.parametrize("name", ["episode", "own_cost"])
+def test_an_episode(name, library, tmp_path):
+    printed = run(name, tmp_path, str(library.root))
+    assert "ActionExecuted" in printed
+    assert "Finished" in printed
 
 
 def test_examples_are_short():

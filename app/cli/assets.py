@@ -65,9 +65,11 @@ class AssetsFetch(DataCommand):
         chosen = self.names or source.names()
         is_work = any(self.force or not library.has(name) for name in chosen)
         with worker_pool(self.workers if is_work else 1) as executor:
-            if executor is not None:  # while this one downloads, so that the first episode need not wait for compilers
-                executor.submit(_compile)
+            # While this one downloads, so that the first episode need not wait for compilers.
+            compiled = executor.submit(_compile) if executor is not None else None
             follow(fetch(chosen, source, library, executor, force=self.force))
+            if compiled is not None and not compiled.done():
+                self.say("Compiling renderer and planner, once; this takes up to some minutes")
         return {"objects": list(chosen), "available": list(library.names()), "data_dir": str(self.data_dir)}
 
 
