@@ -65,19 +65,34 @@ _RENEWALS = 10  # at most: something that flickers must not keep a robot going f
 
 
 class Episode:
-    """One table on its way to a goal.
+    """One episode: estimate, plan and push until the table looks like the goal (Algorithm 1 of the paper).
 
-    Whoever drives it takes events one by one: not asking for the next one is a pause, closing the generator is the end.
+    `run` yields events. The episode pauses while the caller does not take the next event, and ends when the caller
+    closes the generator.
 
     Args:
-        world: cameras and pusher.
-        models: of the objects.
-        goal: an image, or poses, perhaps with a photograph of them.
-        settings: may be replaced while the episode runs.
-        rng: draws everything.
-        start: what is known of the first frame already; without it, it is estimated from images with masks.
-        prepared: estimates that are used in place of new ones where they explain the images.
-        parts: that estimate, plan and compare futures.
+        world: the world to observe and act in.
+        models: models of the objects.
+        goal: a goal image, or goal poses.
+        settings: settings. The attribute `settings` may be replaced while the episode runs.
+        rng: random generator of everything random.
+        start: estimate of the first frame, if there is one already. If None, it is estimated from images with masks.
+        prepared: earlier estimates, which are used instead of new ones if they explain the images.
+        parts: replacements of the estimators, the planner and the cost.
+
+    Example:
+        >>> world = Tabletop(assets, request=SceneRequest(names=(name,)))
+        >>> world.arrange(seed=0)
+        >>> episode = Episode(
+        ...     world,
+        ...     load_scene_models((name,), fields, assets, None),
+        ...     PoseGoal.of(world.truth(), {name: there}),
+        ...     EpisodeSettings(steps=30),
+        ...     np.random.default_rng(0),
+        ... )
+        >>> type(next(episode.run())).__name__  # in full: for event in episode.run(): ...
+        'Observed'
+        >>> world.close()
     """
 
     settings: EpisodeSettings
@@ -110,11 +125,11 @@ class Episode:
         self._expected: SceneState | None = None  # what the last action should have led to
 
     def run(self) -> Iterator[Event]:
-        """Yield everything that happens, until a `Finished`.
+        """Run the episode; yield an event for each thing that happens. The last event is a `Finished`.
 
         Raises:
-            InvalidInput: if the world gives no masks for the first frame, or goal and scene hold other objects.
-            UnknownName: if an object is not known.
+            InvalidInput: if the world has no masks for the first frame, or goal and scene have different objects.
+            UnknownName: if there is no model of an object.
         """
         yield from self._begin()
         if not (yield from self._find_goal()):

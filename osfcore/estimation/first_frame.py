@@ -73,19 +73,19 @@ _SETTLED = 2e-4  # photometric loss; pictures decoded wrongly ended at 3e-4 and 
 
 @dataclass(frozen=True, slots=True)
 class FirstFrameConfig:
-    """How much work a first estimate is.
+    """Settings of `estimate_first`.
 
     Attributes:
-        starts: orientations of each object that CMA refines.
-        population: of CMA-ES for one object and start, by the masked loss (eq. 5).
-        generations: likewise.
-        joint_population: of CMA-ES for the whole scene, by the photometric loss (eq. 6).
-        joint_generations: likewise.
-        coarse_iterations: of Gauss-Newton at half the resolution.
-        fine_iterations: at full resolution.
-        light: "search" for a search of the hemisphere before CMA, "cma" for CMA alone from overhead as in the paper.
-        held_light: unit vector toward a light that is not estimated, to measure what knowing it is worth; None to
-            estimate it.
+        starts: orientations of each object that CMA-ES refines.
+        population: population of CMA-ES for one object and start, by the masked loss (eq. 5).
+        generations: its generations.
+        joint_population: population of CMA-ES for the whole scene, by the photometric loss (eq. 6).
+        joint_generations: its generations.
+        coarse_iterations: iterations of Gauss-Newton at half the resolution.
+        fine_iterations: iterations of Gauss-Newton at full resolution.
+        light: "search" to search the hemisphere before CMA-ES, "cma" for CMA-ES alone, starting from a light overhead
+            as in the paper.
+        held_light: unit vector toward a known light, which is then not estimated; None to estimate the light.
     """
 
     starts: int = 3
@@ -102,17 +102,28 @@ class FirstFrameConfig:
 def estimate_first(
     models: ObjectModels, observation: Observation, rng: np.random.Generator, config: FirstFrameConfig | None = None
 ) -> Iterator[EstimateStep]:
-    """Find all poses and the light; the last step holds the estimate, and the image model of unusual pictures.
+    """Estimate the poses of all objects and the light from images with masks, without an initial guess.
 
     Args:
-        models: fields of the objects and the table.
-        observation: one or more views with masks, of any exposure, linear or sRGB.
-        rng: of the searches.
-        config: how much work to do; under a held light pictures are taken for usual ones.
+        models: models of the objects and the table.
+        observation: one or more views with masks. Any exposure works, and both linear and sRGB values.
+        rng: random generator of the searches.
+        config: settings. With `held_light`, the exposure is assumed to be the usual one.
+
+    Returns:
+        Steps of the search. The last one has `estimate`, and `image_model` if the exposure is not the usual one.
 
     Raises:
-        InvalidInput: without masks, or if an object's masks are all empty.
+        InvalidInput: if there are no masks, or all masks of an object are empty.
         UnknownName: if an object has no field.
+
+    Example:
+        >>> from osfcore.estimation.first_frame import FirstFrameConfig
+        >>> quick = FirstFrameConfig(starts=1, fine_iterations=1)
+        >>> *_, last = estimate_first(models, observation, np.random.default_rng(0), quick)
+        >>> error = last.estimate.state.pose(name).position - state.pose(name).position
+        >>> bool(np.linalg.norm(error) < 0.002)  # [m]
+        True
     """
     config = config or FirstFrameConfig()
     models.check(observation.names)

@@ -52,14 +52,14 @@ _BESIDE_M = 0.04
 
 @dataclass(frozen=True, slots=True)
 class GoalImageConfig:
-    """How much work a goal estimate is.
+    """Settings of `estimate_goal`.
 
     Attributes:
-        side: of the image that templates are slid over [px].
-        planar_iterations: of Gauss-Newton over position and yaw.
-        free_iterations: of Gauss-Newton over whole poses.
-        widen_all: match every object again in all resting orientations, also where none is doubted.
-        held_light: unit vector toward a light that is not estimated; None to estimate it.
+        side: longest side of the image that templates are matched in [px].
+        planar_iterations: iterations of Gauss-Newton over position and yaw.
+        free_iterations: iterations of Gauss-Newton over whole poses.
+        widen_all: whether to match every object in all its resting orientations, and not only doubtful ones.
+        held_light: unit vector toward a known light, which is then not estimated; None to estimate the light.
     """
 
     side: int = FINE_SIDE
@@ -76,18 +76,31 @@ def estimate_goal(
     config: GoalImageConfig | None = None,
     shares: Mapping[str, float] | None = None,
 ) -> Iterator[EstimateStep]:
-    """Find poses and light of a goal image; the last step holds the estimate.
+    """Estimate the poses and the light that one goal image shows.
 
     Args:
-        models: fields of the objects and the table.
-        observation: one view without the pusher; masks play no part.
-        prior: the scene now, or any other guess: how objects lie matters most; places and light save time if right.
-        config: how much work to do.
-        shares: by object, its residual in the scene now as a share of its level, see `goal_allowance`.
+        models: models of the objects and the table.
+        observation: one view without the pusher. Masks are ignored.
+        prior: the present scene, or another guess. The resting orientations in it matter most; right positions and a
+            right light save time.
+        config: settings.
+        shares: for each object, its residual in the present scene as a share of its brightness there, as
+            `osfcore.estimation.uncertainty.relative_residuals` returns it.
+
+    Returns:
+        Steps of the search. The last one has `estimate`.
 
     Raises:
-        InvalidInput: if there is more than one view, or the prior is of other objects.
+        InvalidInput: if there is more than one view, or the prior has other objects.
         UnknownName: if an object has no field.
+
+    Example:
+        >>> image = models.together.render(SceneBatch.of(state), [goal_camera()]).rgb[0, 0]
+        >>> seen = GoalImage(goal_camera(), image).observed(state.names)
+        >>> *_, last = estimate_goal(models, seen, prior=state)
+        >>> error = last.estimate.state.pose(name).position - state.pose(name).position
+        >>> bool(np.linalg.norm(error) < 0.003)  # [m]
+        True
     """
     models.check(observation.names)
     if len(observation.cameras) != 1:

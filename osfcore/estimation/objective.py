@@ -236,11 +236,25 @@ FieldT = TypeVar("FieldT", bound=DensityGrid)
 
 
 class ObjectModels:
-    """Fields of the objects, and two renderers of them.
+    """What an estimator knows of the objects: their fields, renderers of them, and their symmetries.
+
+    Args:
+        fields: fields of the objects, by name.
+        table: field of the table.
+        device: where images are rendered, as in `SceneRenderer`.
+        symmetries: orientations of each object that look the same; none for objects that are left out.
 
     Attributes:
-        alone: draws objects over black.
-        together: draws them on the table.
+        alone: renderer of the objects over black.
+        together: renderer of the objects on the table.
+
+    Raises:
+        InvalidInput: if there is no such device.
+
+    Example:
+        >>> models = ObjectModels({name: fields.load(name)}, fields.load_table())
+        >>> models.together.names
+        ('006_mustard_bottle',)
     """
 
     def __init__(
@@ -251,17 +265,6 @@ class ObjectModels:
         device: str = "cpu",
         symmetries: Mapping[str, Symmetry] | None = None,
     ) -> None:
-        """Prepare fields.
-
-        Args:
-            fields: by name of the object.
-            table: what the objects lie on.
-            device: where images are rendered, see `SceneRenderer`.
-            symmetries: which orientations of an object look the same; none of those left out.
-
-        Raises:
-            InvalidInput: if there is no such device.
-        """
         alone, together = (SceneRenderer(fields, ground, device=device) for ground in (None, table))
         self._set(fields, alone, together)
         self._changeable = fields, table, device
@@ -274,12 +277,12 @@ class ObjectModels:
         fields: Mapping[str, FieldT],
         table: TableField,
     ) -> ObjectModels:
-        """Models whose fields another renderer draws.
+        """Return models whose fields another renderer draws.
 
         Args:
-            renderer: makes renderers of fields, on a table or over black.
-            fields: by name of the object.
-            table: what the objects lie on.
+            renderer: makes a renderer of fields, on a table or over black.
+            fields: fields of the objects, by name.
+            table: field of the table.
         """
         models = cls.__new__(cls)
         models._set(fields, renderer(fields, None), renderer(fields, table))
@@ -294,21 +297,21 @@ class ObjectModels:
 
     @property
     def can_change(self) -> bool:
-        """Whether `changed` works, which it does not where another renderer draws fields of its own kind."""
+        """Whether `changed` works. It does not work with models made by `rendered_by`."""
         return self._changeable is not None
 
     def changed(
         self, names: Iterable[str], field: Callable[[KiloOSF], KiloOSF], table: Callable[[TableField], TableField]
     ) -> ObjectModels:
-        """Models of some of the objects with another look and the same shapes.
+        """Return models of some of the objects that look different but have the same shapes.
 
         Args:
-            names: of the objects.
-            field: from a field to the one in its place, of the same density.
-            table: likewise of the table.
+            names: names of the objects.
+            field: maps each field to its replacement, which must have the same density.
+            table: maps the table to its replacement.
 
         Raises:
-            InvalidInput: where `can_change` is false.
+            InvalidInput: if `can_change` is false.
         """
         if self._changeable is None:
             raise InvalidInput(
@@ -321,10 +324,10 @@ class ObjectModels:
         return models
 
     def check(self, names: tuple[str, ...]) -> None:
-        """Refuse objects without a field.
+        """Check that objects have a field.
 
         Raises:
-            UnknownName: if one has none.
+            UnknownName: if an object has none.
         """
         for name in names:
             if name not in self._fields:
@@ -333,19 +336,19 @@ class ObjectModels:
     def turned(
         self, name: str, one: Float[np.ndarray, "4"], others: Float[np.ndarray, "B 4"]
     ) -> Float[np.ndarray, "B"]:
-        """Angles between an object's orientations [rad], over all that look like `one`."""
+        """Return the angles [rad] from each of `others` to the nearest orientation that looks like `one`."""
         symmetry = self._symmetries.get(name, Symmetry("none"))
         return np.array([rotation_error(symmetry, other, one) for other in others])
 
     def resting(self, name: str) -> RestingOrientations:
-        """Return how an object can lie on a table; it is found when first asked for."""
+        """Return the orientations in which an object can rest on a table. The first call computes them."""
         if name not in self._resting:
             self.check((name,))
             self._resting[name] = resting_orientations(self._fields[name])
         return self._resting[name]
 
     def centre_of_mass(self, params: SceneParameters, number: int) -> Float[np.ndarray, "3"]:
-        """Where the centre of mass of an object of a scene is [m]."""
+        """Return the centre of mass of one object of a scene, in the world [m]."""
         centre = self.resting(params.names[number]).centre
         return params.positions[number] + rotate(params.quaternions[number], centre)
 

@@ -55,25 +55,26 @@ from osfcore.geometry.states import Observation, SceneState
 
 @dataclass(frozen=True, slots=True)
 class TrackingConfig:
-    """How a later frame is estimated.
+    """Settings of `estimate_next`. A residual is a root mean square error over an object's pixels [radiance].
 
     Attributes:
-        stays_below: residual of an object [radiance] up to which it counts as standing where it was expected.
-        fits_below: the same for one that was found anew: then it may fit better.
-        fits_finely_below: the same in images of full resolution, in which what is right fits better.
-        lamp_above: residual of everything but the objects [radiance] from which the lamp may have moved.
-        lamp_hint: share of the loss to which the best of few other lights must lower it before more are tried.
-        lamp_gain: share of the loss to which another light must lower it to be believed.
-        rough_sweeps: of the descent over objects that moved, first in images of a quarter of the resolution,
-        sweeps: then of half of it,
-        fine_sweeps: then of that with more rays a pixel,
-        closest_sweeps: and of full resolution for those that do not fit in it.
-        population: candidates per generation of the search for objects that do not fit.
-        generations: of that search.
-        shift: its spread [m].
-        turn: its spread about the vertical [rad]; a quarter of it about other axes.
-        turned_within: loss of an object turned about the vertical, over its own, up to which it may be turned wrongly.
-        reach: how far around an object's expected place images are looked at [m].
+        stays_below: largest residual of an object that counts as being where it was expected.
+        fits_below: largest residual of an object that was searched and counts as found.
+        fits_finely_below: the same in images of full resolution.
+        lamp_above: residual of all other pixels above which the lamp may have moved.
+        lamp_hint: share of the loss that the best of a few other lights must reach before more lights are tried.
+        lamp_gain: share of the loss that another light must reach to be accepted.
+        rough_sweeps: sweeps of Gauss-Newton over the objects that moved, at a quarter of the resolution.
+        sweeps: sweeps at half the resolution.
+        fine_sweeps: sweeps at half the resolution with more rays per pixel.
+        closest_sweeps: sweeps at full resolution, over objects that do not fit there.
+        population: population of CMA-ES for objects that do not fit.
+        generations: its generations.
+        shift: its initial standard deviation of positions [m].
+        turn: its initial standard deviation about the vertical [rad]; a quarter of it about other axes.
+        turned_within: ratio of the loss of an object turned about the vertical to its own loss, below which the object
+            may be turned wrongly.
+        reach: margin around an object's expected position in which images are compared [m].
     """
 
     stays_below: float = 0.05
@@ -102,19 +103,28 @@ def estimate_next(
     config: TrackingConfig | None = None,
     usual: Float[np.ndarray, "N"] | None = None,
 ) -> Iterator[EstimateStep]:
-    """Find poses again; the last step holds the estimate.
+    """Estimate poses, and the light if it moved, in images that follow an earlier estimate.
 
     Args:
-        models: fields of the objects and the table.
-        observation: one or more views; masks play no part.
-        expected: the last estimate, or what was predicted from it, with the light as last estimated.
-        rng: of the search.
-        config: how much work to do.
-        usual: residuals that are normal for the observation's objects, see `expected_residuals`; 0 by default.
+        models: models of the objects and the table.
+        observation: one or more views. Masks are ignored.
+        expected: the last estimate, or a prediction from it, with the last estimate of the light.
+        rng: random generator of the search.
+        config: settings.
+        usual: residuals that are normal for these objects [radiance], as
+            `osfcore.estimation.uncertainty.expected_residuals` returns them; 0 by default.
+
+    Returns:
+        Steps of the search. The last one has `estimate`.
 
     Raises:
-        InvalidInput: if the expected state is of other objects.
+        InvalidInput: if the expected state has other objects.
         UnknownName: if an object has no field.
+
+    Example:
+        >>> *_, last = estimate_next(models, observation, state, np.random.default_rng(0))
+        >>> last.estimate.trusted
+        True
     """
     models.check(observation.names)
     if set(expected.names) != set(observation.names):

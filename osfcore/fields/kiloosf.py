@@ -48,19 +48,28 @@ def network_size(hidden: int) -> int:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KiloOSF:
-    """A trained field in its object's frame. Lengths are in the units of its training set: metres for our own.
+    """A trained neural scattering function of one object, in the object's frame.
+
+    It holds features on the corners of a voxel grid and one tiny network for each cell of a coarser grid. Lengths are
+    in the units of its training set, which is metres unless the data came from elsewhere. `FieldLibrary.load` reads
+    one; `SceneRenderer` draws it.
 
     Attributes:
         origin: corner (0, 0, 0) of the voxel grid [m].
         voxel: side of a voxel [m].
-        index: row of each corner's features; 0 outside the shell.
-        rows: features of the corners in the shell; row 0 is empty space.
-        cells: number of the tiny network of each cell; cells divide the grid's box evenly.
+        index: row in `rows` of each corner; 0 for corners outside the shell around the surface.
+        rows: features of the M - 1 corners in the shell; row 0 is empty space.
+        cells: number of the tiny network of each cell. The cells divide the grid's box evenly.
         networks: parameters of C tiny networks, layer by layer: weights (inputs x outputs), then biases.
         hidden: width of the tiny networks.
-        ambient: what an unlit white point sends out, per colour.
-        macro: of each block of 4 x 4 x 4 voxels, how many blocks away the nearest density is; derived.
-        density: g on every corner; derived.
+        ambient: radiance of an unlit white point, per colour.
+        density: density feature g of every corner; derived from `rows`.
+        macro: for each block of 4 x 4 x 4 voxels, distance to the nearest block with density [blocks]; derived.
+
+    Example:
+        >>> lowest, highest = fields.load("006_mustard_bottle").extent
+        >>> (highest - lowest).round(2)  # width, depth and height of the bottle [m]
+        array([0.1 , 0.07, 0.2 ], dtype=float32)
     """
 
     origin: Float32[np.ndarray, "3"]

@@ -177,7 +177,15 @@ def cameras_of(entries: Iterable[CameraJson]) -> tuple[Camera, ...]:
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """Return one camera as scene.json holds it: "name", "T_world_camera" 4 x 4, "K" 3 x 3 [px], "width", "height"."""
+    """Return a camera in the JSON form of scene.json.
+
+    Returns:
+        "name", "T_world_camera" (4 x 4), "K" (3 x 3) [px], "width" and "height" [px].
+
+    Example:
+        >>> camera_to_json(goal_camera(64))["width"]
+        64
+    """
     return encode(CameraJson.of(camera))
 
 

@@ -846,11 +846,18 @@ _STRAIGHT = 0.25  # share of pushes that are aimed at the goal's place alone
 
 
 class PushProposals:
-    """Proposes pushes among some objects.
+    """Proposes sequences of straight pushes that bring objects to their goals.
 
     Args:
-        shapes: of the objects, by name.
-        predict: fills tables of pushes; without it, all pushes are straight ones toward the goal's place.
+        shapes: shapes of the objects, by name.
+        predict: rollout of a dynamics model, which computes what a push from each side does; None to propose only
+            pushes straight toward the goal's position.
+
+    Example:
+        >>> proposals = PushProposals(load_shapes(None, fields, [name]))
+        >>> actions = proposals.draw(state, goal, count=20, horizon=30, rng=np.random.default_rng(0))
+        >>> actions.shape[1:]  # 30 velocities (vx, vy, 0) [m/s]
+        (30, 3)
     """
 
     def __init__(self, shapes: Mapping[str, ObjectShape], predict: PushPredictor | None = None) -> None:
@@ -861,14 +868,15 @@ class PushProposals:
     def draw(
         self, state: SceneState, goal: PoseGoal, count: int, horizon: int, rng: np.random.Generator
     ) -> Float[np.ndarray, "P T 3"]:
-        """Propose about `count` sequences; none where everything is in its place or the pusher has no room.
+        """Propose about `count` sequences of actions [m/s].
 
         Args:
-            state: of the scene, with its pusher.
-            goal: where everything should be.
-            count: of sequences.
-            horizon: length of the sequences.
-            rng: draws orders, angles, offsets, lengths and speeds.
+            state: state of the scene, with a pusher.
+            goal: the goal poses.
+            count: largest number of sequences. None come back if all objects are at their goals, or the pusher has no
+                room.
+            horizon: actions in each sequence (T).
+            rng: random generator of orders, angles, offsets, lengths and speeds.
         """
         now, goals = ([of.pose(name) for name in state.names] for of in (state, goal))
         off = [n for n, (here, there) in enumerate(zip(now, goals, strict=True)) if _is_off(here, there)]
@@ -887,12 +895,12 @@ class PushProposals:
         return np.array(proposals[:count]).reshape(-1, horizon, 3)
 
     def recombine(self, goal: PoseGoal, rollouts: Rollouts, count: int) -> Float[np.ndarray, "P T 3"]:
-        """At most `count` sequences of pushes that succeeded in different futures (`recombined`).
+        """Return at most `count` sequences [m/s] that combine successful pushes of different futures.
 
         Args:
-            goal: where everything should be.
-            rollouts: the futures, from one state.
-            count: of sequences.
+            goal: the goal poses.
+            rollouts: futures that begin in one state.
+            count: largest number of sequences.
         """
         return recombined(rollouts, object_costs(rollouts, goal), self._outlines(rollouts.names), count)
 

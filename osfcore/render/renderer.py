@@ -419,24 +419,28 @@ _MOST_PACKS = 8
 
 
 class SceneRenderer:
-    """Renders scenes of known fields.
+    """Renders scenes of objects with known fields.
 
-    Volume rendering after paper eq. 3, weighted by density; shadows of objects and pusher fall on each other and on the
-    table with soft transmittance along the way to the light. An object does not shade itself here: its field already
-    holds that.
+    It does volume rendering after paper eq. 3, weighted by density. Objects and pusher cast soft shadows on each other
+    and on the table: the transmittance along the ray to the light. Shadows of an object on itself are part of its
+    field.
+
+    Args:
+        fields: fields of the objects, by name.
+        table: field of the table; None for a black background.
+        device: "cpu" for compiled code on all cores, "cuda" for PyTorch on a GPU, "auto" for a GPU if there is one.
+
+    Raises:
+        InvalidInput: if there is no such device.
+
+    Example:
+        >>> renderer = SceneRenderer({name: fields.load(name)}, fields.load_table())
+        >>> seen = renderer.render(SceneBatch.of(state), default_cameras(64), outputs={"rgb", "depth"})
+        >>> seen.rgb.shape, seen.depth.shape
+        ((1, 4, 64, 64, 3), (1, 4, 64, 64))
     """
 
     def __init__(self, fields: Mapping[str, KiloOSF], table: TableField | None, *, device: str = "cpu") -> None:
-        """Prepare fields.
-
-        Args:
-            fields: by name.
-            table: None for black surroundings.
-            device: "cpu" for compiled code on all cores, "cuda" for PyTorch on a GPU, "auto" for a GPU if there is one.
-
-        Raises:
-            InvalidInput: if there is no such device.
-        """
         self._fields = dict(fields)
         self._table = table
         self._device = "cpu" if device == "cpu" else pick_device(device).type
@@ -444,7 +448,7 @@ class SceneRenderer:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Objects that can be drawn."""
+        """Names of the objects that can be drawn."""
         return tuple(self._fields)
 
     def render(
@@ -461,13 +465,17 @@ class SceneRenderer:
         Args:
             batch: B scenes.
             cameras: V cameras of one image size.
-            quality: `EXACT` or `PLANNING`, or anything between.
-            outputs: which of "rgb", "opacity", "masks", "depth"; colours always come.
-            only: pixels to look at; all others stay black and empty.
+            quality: accuracy of the images, exact by default.
+            outputs: any of "rgb", "opacity", "masks", "depth". "rgb" is always returned.
+            only: pixels to render; all others stay black and empty.
+
+        Returns:
+            The images, as arrays over B scenes and V views.
 
         Raises:
-            UnknownName: if an object has no field here.
-            InvalidInput: if cameras differ in size, an output is unknown, or `only` is of another shape.
+            UnknownName: if this renderer has no field of an object.
+            InvalidInput: if there is no camera, the cameras differ in size, an output is unknown, or `only` has
+                another shape.
         """
         size = check_request(self._fields, batch, cameras, outputs)
         if only is not None and only.shape != (len(cameras), *size):

@@ -146,16 +146,27 @@ def _put(world: Tabletop, name: str, pose: Pose) -> bool:
 
 
 def random_goal(world: Tabletop, seed: int, moved: int | None) -> tuple[SceneState, tuple[str, ...]]:
-    """Draw a random layout with some objects elsewhere; return it and which moved. The world is left like that.
+    """Move some objects of a simulated table to random places, to make a goal. The world stays in the goal state.
 
     Args:
-        world: with the objects where they start from.
-        seed: of everything random.
-        moved: how many objects move; None for a random number.
+        world: world with the objects at their start.
+        seed: seed of everything random.
+        moved: number of objects that move; None for a random number.
+
+    Returns:
+        The goal state, and the names of the objects that moved.
 
     Raises:
         InvalidInput: if `moved` is not between 1 and the number of objects.
-        NoRoom: if no layout has room.
+        NoRoom: if no layout without overlaps was found.
+
+    Example:
+        >>> world = Tabletop(assets, request=SceneRequest(names=(name,)))
+        >>> world.arrange(seed=0)
+        >>> goal_state, moved = random_goal(world, seed=1, moved=1)
+        >>> moved
+        ('006_mustard_bottle',)
+        >>> world.close()
     """
     start = world.truth()
     if moved is not None:
