@@ -80,9 +80,9 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         data_dir: whose `objects` are used; the program's own if None.
         names: objects to choose from; all that are there if None.
         objects: in each scene (N).
-        family: of the tasks: "shifted", "turned", "crowded", "relit" or "upright".
+        family: family of the tasks: "shifted", "turned", "crowded", "relit" or "upright".
         obs: what is observed: "poses", "pixels" or "both".
-        image_side: of observed images [px].
+        image_side: side of observed images [px].
         render_mode: "rgb_array" or None.
 
     Attributes:
@@ -132,7 +132,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """Begin a new task.
 
         Args:
-            seed: of this task and all that follow; None to go on.
+            seed: seed of this task and all that follow; None to go on.
             options: {"task_seed": s, "task_number": n} for task n of the set that evaluations use with seed s and the
                 same objects; None for a random task.
 

@@ -381,7 +381,7 @@ class AdaptedModels:
 
     Attributes:
         models: fields and table, with the scene's ambient light and albedo.
-        image_model: of the pictures; None for those that fields were made for.
+        image_model: image model of the pictures; None for those that fields were made for.
     """
 
     models: ObjectModels
@@ -391,8 +391,8 @@ class AdaptedModels:
         """Adapt these models, which must not be adapted yet, to pictures of another kind.
 
         Args:
-            image_model: of the pictures; None leaves everything as it is.
-            names: of the objects that are needed.
+            image_model: image model of the pictures; None leaves everything as it is.
+            names: names of the objects that are needed.
         """
         return self if image_model is None else AdaptedModels(adapted(self.models, names, image_model), image_model)
 
@@ -420,7 +420,7 @@ def estimate_goal_image(
         scene: models for the pictures of the first frame.
         goal: one view.
         prior: how the objects lie now.
-        config: how much work to do.
+        config: settings.
         shares: by object, its residual in the first frame as a share of its level, see `goal_allowance`.
     """
     best = yield from all_but_last(_estimated(scene, goal, prior, config, shares))
@@ -466,10 +466,10 @@ def relocalize(
     The camera is one of those that see most of the workspace, drawn at random so that another search uses another one.
 
     Args:
-        models: fields of the objects and the table.
+        models: models of the objects and the table.
         observation: all views, at best without anything in front.
         last: the estimate whose doubted objects are looked for.
-        rng: of the search.
+        rng: random generator of the search.
         config: how the one image is searched.
     """
     state = last.state

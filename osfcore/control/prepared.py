@@ -30,7 +30,7 @@ class PreparedLook:
     """An estimate and how well it explained the images that it was made from.
 
     Attributes:
-        estimate: of poses and light.
+        estimate: estimate of poses and light.
         residuals: RMS of each object there [radiance], see `expected_residuals`.
     """
 
@@ -56,7 +56,7 @@ class PreparedLooks:
     """Estimates that were made beforehand of a table and its goal image.
 
     Attributes:
-        first: of the first frame.
+        first: estimate of the first frame.
         goal: of the goal image.
     """
 

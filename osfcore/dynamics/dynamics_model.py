@@ -28,7 +28,7 @@ class DynamicsModel(Protocol):
         """Predict poses under K sequences of T actions.
 
         Args:
-            state: of the scene, with its pusher.
+            state: state of the scene, with its pusher.
             actions: velocities (vx, vy, 0) of the pusher [m/s], each held for 0.2 s.
             before: the same objects one action ago, for models that consider how things move.
         """

@@ -71,11 +71,11 @@ class Graph(NamedTuple):
         number: its shape.
         frame: rotation from the world to the heading's frame.
         rotation: from the object's frame to the heading's.
-        centre: of mass [m].
+        centre: centre of mass [m].
         linear: displacement of the last substep [m].
         angular: rotation vector of the last substep [rad].
         outline: seen from above [m].
-        shift: of the pusher in this substep [m].
+        shift: shift of the pusher in this substep [m].
         touched: which objects the pusher can touch.
         pusher: where, if so.
         receiver, sender: numbers among the A objects, for each of the E ordered pairs that can touch.
@@ -105,9 +105,9 @@ def adjacency(
     """Return which objects could collide during a step (paper eq. 8, with the deviation stated above).
 
     Args:
-        position: of the centres [m].
+        position: position of the centres [m].
         half_extent: longest half-extent of each object [m].
-        travel_m: of the pusher in one step [m].
+        travel_m: travel of the pusher in one step [m].
     """
     distance = (position[:, :, None] - position[:, None]).norm(dim=-1)
     kappa = half_extent[:, :, None] + half_extent[:, None] + travel_m
@@ -265,7 +265,7 @@ class Inputs(NamedTuple):
     """A graph in numbers.
 
     Attributes:
-        nodes: of each object.
+        nodes: nodes of each object.
         edges: from the pusher to the objects it can touch, then between objects.
         receiver: object at the end of each edge.
         sender: object at the beginning of each edge between objects.
@@ -664,7 +664,7 @@ def unroll(
         table: shapes of the objects.
         number: which of them each object is.
         motion: the scenes before the first action.
-        velocity: of the pusher in each action [m/s].
+        velocity: velocity of the pusher in each action [m/s].
         mirror: scenes to reflect along the heading, in training.
     """
     path = pusher_path(motion.pusher.double().cpu().numpy(), velocity.transpose(0, 1).double().cpu().numpy())

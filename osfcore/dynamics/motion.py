@@ -52,10 +52,10 @@ def push_motion(
     """Return the motion of an object pushed at a contact: displacement (x, y) [m] and turn about the vertical [rad].
 
     Args:
-        point: of contact, from the centre of friction [m].
+        point: point of contact, from the centre of friction [m].
         inward: normal into the object.
         depth: how far the contact must move along the normal [m].
-        shift: of what pushes; its tangential part drags the contact along while friction holds [m].
+        shift: shift of what pushes; its tangential part drags the contact along while friction holds [m].
         arm: c, moment over force that friction with the table can hold [m].
 
     Returns:
@@ -178,7 +178,7 @@ def lowest_point(
     Args:
         table: shapes of the objects.
         number: which of them each object is.
-        centre: of mass, in the world [m].
+        centre: centre of mass, in the world [m].
         quaternion: orientations in the world, unit.
     """
     around = functional.pad(ASIDE * circle(8, centre.device), (0, 1), value=-1.0)

@@ -108,7 +108,7 @@ class Optimizers:
 
         Args:
             network: to train.
-            rate: of learning, at its highest.
+            rate: highest learning rate.
         """
         self.network, self.average = network, copy.deepcopy(network)
         is_inner = [p.ndim == 2 and p is not network.decoder[-1].weight for p in network.parameters()]
@@ -125,7 +125,7 @@ class Optimizers:
 
         Args:
             loss: to minimise.
-            share: of the highest rate.
+            share: share of the highest rate.
             done: steps before this one; at the beginning the average forgets faster.
         """
         for optimiser, rate in zip(self._optimisers, self._rates, strict=True):
@@ -175,7 +175,7 @@ class Recording:
         velocity: commanded in each action [m/s].
         starts: episode and action at which windows of `length` actions may start.
         is_busy: whether something moves or is touched in such a window.
-        length: of the windows [actions].
+        length: length of the windows [actions].
     """
 
     number: Int[Tensor, "E N"]
@@ -199,8 +199,8 @@ def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], l
 
     Args:
         episodes: recorded with poses within their actions.
-        shapes: of all objects in them, by name; numbered by sorted names.
-        length: of the windows [actions].
+        shapes: shapes of all objects in them, by name; numbered by sorted names.
+        length: length of the windows [actions].
 
     Raises:
         InvalidInput: if the episodes were recorded without substeps, differ in length or number of objects, or hold no
@@ -277,7 +277,7 @@ def batch(
         recording: that holds them.
         table: shapes, on `device`.
         windows: numbers in `recording.starts`.
-        device: of the tensors.
+        device: device of the tensors.
         coarse: windows that start with means over the action before instead, all that a rollout from observed states
             knows; by default none.
     """
@@ -341,7 +341,7 @@ class Substeps(NamedTuple):
         number: shape of each object.
         motion: before.
         velocity: commanded [m/s].
-        shift: of the pusher [m].
+        shift: shift of the pusher [m].
         centre: centres of mass, after [m].
         quaternion: orientations, after.
     """
@@ -360,8 +360,8 @@ class _Rows:
 
     Attributes:
         values: the rows.
-        first: of each graph.
-        count: of each graph.
+        first: first of each graph.
+        count: number of each graph.
     """
 
     values: Tensor
@@ -616,7 +616,7 @@ class PushTraining(ABC):
         out: file to write.
         total: iterations.
         patience: measurements without a better one after which training stops.
-        seed: of what is drawn.
+        seed: seed of what is drawn.
 
     Attributes:
         best: the best measurement on held-out episodes; None before the first.
@@ -807,11 +807,11 @@ class TrainDynamics:
         long_iterations: on windows of three actions, after these.
         long_batch: windows in each.
         hidden: width of the network.
-        rate: of learning, at its highest; on windows a tenth of it; of what is no matrix half of it.
+        rate: highest learning rate; on windows a tenth of it; of what is no matrix half of it.
         patience: measurements on held-out episodes without a better one after which training stops.
         without: objects whose episodes are left out.
         device: "auto", "cpu" or "cuda".
-        seed: of everything random.
+        seed: seed of everything random.
     """
 
     data: tuple[Path, ...]
@@ -839,7 +839,7 @@ def train_dynamics(config: TrainDynamics, shapes: Mapping[str, ObjectShape]) -> 
 
     Args:
         config: what to train on.
-        shapes: of all objects with a field; episodes with other objects are left out.
+        shapes: shapes of all objects with a field; episodes with other objects are left out.
 
     Raises:
         InvalidInput: if a number is out of range, the device is not there, or nothing is left to learn from.

@@ -42,7 +42,7 @@ class ContentChecker:
     """Checks photos for the objects of one set of models; keeps their palettes.
 
     Args:
-        models: fields of the objects and the table.
+        models: models of the objects and the table.
     """
 
     def __init__(self, models: ObjectModels) -> None:

@@ -260,8 +260,8 @@ class _GoalImageEstimator:
         """Refine positions and yaw on the table, then whole poses, by Gauss-Newton.
 
         Args:
-            params: the guess.
-            matches: of each object; those nearby are compared.
+            params: guess of the scene.
+            matches: matches of each object; those nearby are compared.
             moved: numbers of the objects whose places and orientations are in question; the others are only refined.
         """
         at, note = GaussNewtonState.at(params), "On the table"

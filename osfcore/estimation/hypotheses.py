@@ -60,7 +60,7 @@ def yaw_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -
     Args:
         models: fields, for the centre of mass.
         params: the guess; the object's own pose is not among the result.
-        number: of the object.
+        number: index of the object.
     """
     quaternions = quaternion_multiply(full_circle(_YAWS)[1:], params.quaternions[number][None])
     return models.resting(params.names[number]).poses_at(models.centre_of_mass(params, number), quaternions)
@@ -76,7 +76,7 @@ def side_hypotheses(models: ObjectModels, params: SceneParameters, number: int) 
     Args:
         models: fields, for the sides, and the centre of mass.
         params: the guess; the side that the object lies on is not among the result.
-        number: of the object.
+        number: index of the object.
     """
     resting, own = models.resting(params.names[number]), params.quaternions[number]
     sides = rotate(quaternion_conjugate(resting.quaternions), _DOWN)
@@ -109,12 +109,12 @@ def compare_orientations(
     orientations residuals are 0.038 at most, under wrong ones 0.038 and more (`docs/notes/estimation.md`).
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         rough: images in which hypotheses are ranked and first refined: they have the widest basins of attraction.
         coarse: images in which the first of them are ranked again, and the best refined further.
         fine: images in which the best of them is compared.
         at: the scene so far.
-        number: of the object.
+        number: index of the object.
         others: poses that it might have instead, a batch.
 
     Returns:
@@ -193,8 +193,8 @@ def table_errors(models: ObjectModels, views: ObservedViews, lit: float | None =
     """Squared error of the first view's pixels if they show the table.
 
     Args:
-        models: fields.
-        views: what was observed.
+        models: models of the objects and the table.
+        views: the images.
         lit: light on the lit table, see `lit_table_level`: then each pixel shows that, or shadow. Else it is lit or
             shaded at will, and grey objects pass for table, too.
     """
@@ -213,7 +213,7 @@ def scene_errors(models: ObjectModels, views: ObservedViews, params: SceneParame
     """Squared error of the first view's pixels, summed over the colours and truncated.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         views: what was observed; only the first view counts.
         params: the scene to render, such as the objects found so far.
     """
@@ -235,10 +235,10 @@ def match_templates(
     """Look for an object in the first view, in given orientations and at given heights of its origin [m].
 
     Args:
-        models: fields.
-        views: what was observed.
-        name: of the object.
-        quaternions: of the orientations.
+        models: models of the objects and the table.
+        views: the images.
+        name: name of the object.
+        quaternions: quaternions of the orientations.
         heights: for each of them.
         most: how many matches are kept.
         behind: squared errors of the pixels without the object; those of the table under its own light by default.
@@ -380,10 +380,10 @@ def reassign_poses(
     """Put each object in turn at the match that explains whole images better than its pose does, if any does.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         views: images to compare with.
-        params: the guess.
-        matches: of each object, in the guess's order.
+        params: guess of the scene.
+        matches: matches of each object, in the guess's order.
     """
     for n, found in enumerate(matches):
         params, _ = best_placement(models, views, params, n, found)
@@ -396,9 +396,9 @@ def best_placement(
     """Put an object where the photometric loss is least, where it is or at a match; return the scene and its loss.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         views: images to compare with.
-        params: the guess.
+        params: guess of the scene.
         n: number of the object.
         found: its matches, perhaps none.
     """
@@ -431,10 +431,10 @@ class SceneAssembly:
     """Puts scenes together from matches.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         rough: images for all lights.
         coarse: images for the best of them.
-        matches: of each object.
+        matches: matches of each object.
     """
 
     def __init__(

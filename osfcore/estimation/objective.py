@@ -40,8 +40,8 @@ class SceneParameters:
     """The scene at which the parameter vector is zero.
 
     Attributes:
-        names: of the N objects.
-        positions: of the objects [m].
+        names: names of the N objects.
+        positions: positions of the objects [m].
         quaternions: unit.
         light: unit vector toward the light.
         pusher: its centre [m], or None.
@@ -146,9 +146,9 @@ class RestingOrientations:
 
     Attributes:
         quaternions: rotations from the object's frame to the world.
-        heights: of the centre of mass above the table [m].
+        heights: heights of the centre of mass above the table [m].
         centre: the centre of mass of a solid body of that shape, in the object's frame [m].
-        radius: of the sphere around that centre that holds the object [m].
+        radius: radius of the sphere around that centre that holds the object [m].
         hull: vertices of the convex hull, in the object's frame [m].
     """
 
@@ -371,7 +371,7 @@ class ObservedViews:
         images: linear RGB.
         masks: share of each pixel that shows each object, or None.
         pusher: centre of the pusher [m], or None.
-        quality: of what is rendered to compare with.
+        quality: quality of what is rendered to compare with.
         only: pixels that count, where not all do.
     """
 
@@ -417,8 +417,8 @@ class ObjectView:
         rgb: the object over black (paper eq. 5: image times mask).
         mask: share of each pixel that shows it.
         valid: pixels in which no other object hides it.
-        area: of the mask [px]; at least 1.
-        quality: of what is rendered to compare with.
+        area: area of the mask [px]; at least 1.
+        quality: quality of what is rendered to compare with.
     """
 
     cameras: tuple[Camera, ...]
@@ -434,7 +434,7 @@ def crop_to_masks(views: ObservedViews, number: int) -> ObjectView:
 
     Args:
         views: with masks; views in which the object's is empty are left out, and at least one must not be.
-        number: of the object.
+        number: index of the object.
     """
     assert views.masks is not None
     shown = [v for v, mask in enumerate(views.masks[:, number]) if mask.max() > 0.5]
@@ -462,8 +462,8 @@ def crop_to_object(
     Args:
         views: whole images; those that do not show the object are left out.
         models: fields, for the object's bounding sphere.
-        params: the guess.
-        number: of the object.
+        params: guess of the scene.
+        number: index of the object.
         reach: by how much the windows reach beyond that sphere [m].
     """
     radius, centre = models.resting(params.names[number]).radius, models.centre_of_mass(params, number)
@@ -496,8 +496,8 @@ def crop_to_silhouette(
     Args:
         views: whole images.
         models: fields; the object is rendered alone for its silhouette.
-        params: the guess.
-        number: of the object.
+        params: guess of the scene.
+        number: index of the object.
     """
     own = crop_to_object(views, models, params, number)
     alone = SceneBatch((params.names[number],), params.positions[None, [number]], params.quaternions[None, [number]],
@@ -517,8 +517,8 @@ def crop_camera(camera: Camera, x: int, y: int, width: int, height: int) -> Came
         camera: the other.
         x: left edge of the window in its image [px]; may lie outside.
         y: upper edge likewise [px].
-        width: of the window [px].
-        height: of the window [px].
+        width: width of the window [px].
+        height: height of the window [px].
 
     Raises:
         InvalidInput: if the window's sides are outside 16 to 1024 px.
@@ -555,8 +555,8 @@ def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> 
     """Rendered minus observed [radiance]; 0 where pixels do not count.
 
     Args:
-        models: fields of the objects and the table.
-        views: what was observed.
+        models: models of the objects and the table.
+        views: the images.
         batch: B scenes to render.
     """
     rendered = models.together.render(batch, views.cameras, quality=views.quality, only=views.only)
@@ -578,8 +578,8 @@ def loss_of(models: ObjectModels, views: ObservedViews, params: SceneParameters)
     """Photometric loss of one scene.
 
     Args:
-        models: fields of the objects and the table.
-        views: what was observed.
+        models: models of the objects and the table.
+        views: the images.
         params: the scene.
     """
     return float(photometric_loss(residuals(models, views, params.repeated()))[0])
@@ -591,10 +591,10 @@ def pose_losses(
     """Photometric loss of a scene with one object in each of K poses.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         views: images to compare with, whole ones or windows around the object.
         params: the guess; all other objects and the light stay.
-        number: of the object.
+        number: index of the object.
         poses: the K poses, a batch of `T_world_object`.
     """
     batch = params.repeated(len(poses.position))
@@ -630,8 +630,8 @@ def render_poses(
     """Render one object in B poses, alone.
 
     Args:
-        models: fields.
-        name: of the object.
+        models: models of the objects and the table.
+        name: name of the object.
         part: the crop whose cameras and quality are used.
         poses: the B poses, a batch of `T_world_object`.
         light: unit vector toward the light, the same for all poses.

@@ -45,7 +45,7 @@ def check_table(models: ObjectModels, views: ObservedViews) -> TableVerdict:
     """Compare the table's pixels with the known table.
 
     Args:
-        models: of which the table is used.
+        models: models, of which only the table is used.
         views: pictures with masks.
 
     Returns:
@@ -104,8 +104,8 @@ def adapted(models: ObjectModels, names: Iterable[str], model: ImageModel) -> Ob
 
     Args:
         models: not adapted yet.
-        names: of the objects.
-        model: of the pictures.
+        names: names of the objects.
+        model: model of the pictures.
     """
     return models.changed(
         names, lambda field: scaled_field(field, model.scale, model.ambient), lambda table: _adapted_table(table, model)
@@ -173,7 +173,7 @@ class Calibrator:
 
     Args:
         models: fields as they were made.
-        names: of the objects in the pictures.
+        names: names of the objects in the pictures.
     """
 
     def __init__(self, models: ObjectModels, names: tuple[str, ...]) -> None:

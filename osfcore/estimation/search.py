@@ -162,8 +162,8 @@ def gauss_newton(
     """Minimise the photometric loss; yields after each sweep over the objects and the light.
 
     Args:
-        models: fields.
-        views: what was observed.
+        models: models of the objects and the table.
+        views: the images.
         start: where to begin.
         iterations: sweeps.
         objects: which objects may move; all by default.
@@ -279,8 +279,8 @@ def initial_poses(models: ObjectModels, name: str, part: ObjectView) -> RankedPo
     Rendered under a light from overhead of unknown brightness, since the true one is not known yet.
 
     Args:
-        models: fields.
-        name: of the object.
+        models: models of the objects and the table.
+        name: name of the object.
         part: windows around its masks.
     """
     poses = _poses_along_rays(part, models.resting(name))
@@ -302,8 +302,8 @@ def rank_poses(
     """Sort poses by their masked loss, the best first.
 
     Args:
-        models: fields.
-        name: of the object.
+        models: models of the objects and the table.
+        name: name of the object.
         part: windows around its masks.
         poses: a batch of `T_world_object`.
         light: unit vector toward the light.
@@ -386,13 +386,13 @@ class MultistartCMA:
     """One CMA-ES by the masked loss for each start of an object; a generation of all is rendered as one batch.
 
     Args:
-        models: fields.
-        name: of the object.
+        models: models of the objects and the table.
+        name: name of the object.
         part: where it was observed.
         starts: where to begin.
         light: unit vector toward the light.
         population: candidates per generation and start.
-        rng: of the searches.
+        rng: random generator of the searches.
         any_brightness: the light is not known yet, see `masked_loss`.
     """
 
@@ -468,13 +468,13 @@ def search_scene(
     """Minimise the photometric loss around a guess by CMA-ES.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         views: what was observed, whole images or windows.
         start: the guess; it is a candidate of every generation.
         scales: first standard deviation of each number of the parameter vector; 0 holds a number still.
         population: candidates per generation, besides the guess.
         generations: how many.
-        rng: of the search.
+        rng: random generator of the search.
 
     Yields:
         Each generation.
@@ -519,7 +519,7 @@ def search_light(
     """Find the light under which a rendering of the guessed poses fits the images best.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         coarse: images to try the whole hemisphere on.
         fine: images to refine on.
         params: objects and pusher; its light plays no part.
@@ -541,9 +541,9 @@ def light_loss_ratio(models: ObjectModels, views: ObservedViews, params: ScenePa
     """Least truncated error on the grid over the hemisphere, divided by the error under the guess's own light.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         views: images to compare with; coarse ones will do.
-        params: the guess.
+        params: guess of the scene.
     """
     directions = np.concatenate([params.light[None], hemisphere()])
     losses = _losses(models, views, params, directions)
@@ -573,7 +573,7 @@ def light_neighbours(params: SceneParameters, light: Float[np.ndarray, "3"], ste
     Args:
         params: any scene, of which only the size of the parameter vector plays a part.
         light: the direction in the middle, a unit vector.
-        step: of the grid [rad].
+        step: step of the grid [rad].
     """
     changes = np.zeros((len(_NEIGHBOUR_OFFSETS), params.size))
     changes[:, -LIGHT:] = step * _NEIGHBOUR_OFFSETS
@@ -594,7 +594,7 @@ def table_light(
     """Fit the light on the table to each pixel, as if every pixel showed it.
 
     Args:
-        models: of which the table is used.
+        models: models, of which only the table is used.
         views: pictures.
 
     Returns:
@@ -615,7 +615,7 @@ def lit_table_level(models: ObjectModels, views: ObservedViews) -> float | None:
     """Measure the light x = sin(elevation) on the table where the lamp reaches it: the median over its pixels.
 
     Args:
-        models: of which the table is used.
+        models: models, of which only the table is used.
         views: pictures; masks play no part.
 
     Returns:
@@ -657,10 +657,10 @@ class StepReporter:
             note: what it does, for a person.
             params: the best scene so far.
             tried: poses of each object; shown if there are some of every object, as many as of the fewest.
-            losses: of each object.
+            losses: losses of each object.
             sigma: the search's overall step.
             lights: directions that were tried.
-            loss: of the whole.
+            loss: loss of the whole.
         """
         self.done = min(self.done + 1, self.total)
         candidates = None

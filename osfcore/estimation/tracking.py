@@ -336,8 +336,9 @@ def joint_push_hypotheses(
     """Positions of all objects if some were moved by shares of a push, K combinations; the first is the guess's [m].
 
     Args:
-        params: the guess.
-        numbers: of the objects that may have moved; up to four are combined in all ways, more move by one share.
+        params: guess of the scene.
+        numbers: indices of the objects that may have moved; up to four are combined in all ways, more move by one
+            share.
         push: motion of the pusher [m].
     """
     if len(numbers) <= _MAX_COMBINED:
@@ -355,7 +356,7 @@ def push_hypotheses(models: ObjectModels, params: SceneParameters, number: int, 
     Args:
         models: fields, for the object's centre of mass and how it can roll.
         params: the guess, around which the grid lies.
-        number: of the object.
+        number: index of the object.
         push: motion of the pusher [m]; under 5 mm the grid covers about 2 cm around the guess, and nothing rolls.
     """
     length = float(np.linalg.norm(push))
@@ -379,7 +380,7 @@ def rolling_hypotheses(
     Args:
         models: fields, for the object's centre of mass and how it can roll.
         params: the guess; the object's centre of mass stays.
-        number: of the object.
+        number: index of the object.
         push: motion of the pusher [m]; if it cannot roll the object, only its own pose is returned.
     """
     axis = _rolling_axis(models, params, number, push)
@@ -394,7 +395,7 @@ def resting_hypotheses(models: ObjectModels, params: SceneParameters, number: in
     Args:
         models: fields, for how the object can lie.
         params: the guess; the centre of mass stays above the same point of the table.
-        number: of the object.
+        number: index of the object.
     """
     resting, centre = models.resting(params.names[number]), models.centre_of_mass(params, number)
     centres = np.column_stack([np.tile(centre[:2], (len(resting.heights), 1)), resting.heights])

@@ -44,10 +44,10 @@ class FitQuality:
 
     Attributes:
         residuals: root of mean square error over the pixels of each object in each view; 0 where it shows in none.
-        pixels: of each object in each view, by its rendered opacity.
+        pixels: pixels of each object in each view, by its rendered opacity.
         contrast: standard deviation of the image over the pixels of each object in all views [radiance].
         level: root of mean square of the image over the same pixels [radiance].
-        overlap: of rendered silhouettes and masks over all views (intersection over union); 1 without masks.
+        overlap: overlap of rendered silhouettes and masks over all views (intersection over union); 1 without masks.
         surroundings: root of mean square error over all other pixels.
         spread: estimated variance of a pixel's error.
     """
@@ -65,9 +65,9 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParame
     """Compare a guess with the images.
 
     Args:
-        models: fields of the objects and the table.
+        models: models of the objects and the table.
         views: what was observed; masks, where there are any, give the overlap of silhouettes.
-        params: the guess.
+        params: guess of the scene.
     """
     rendered = models.together.render(
         params.repeated(), views.cameras, quality=views.quality, outputs={"rgb", "opacity"}
@@ -111,7 +111,7 @@ def expected_fit(models: ObjectModels, observation: Observation, state: SceneSta
     """Evaluate how well objects fit where they stand: fields err, and what is normal here is no doubt later.
 
     Args:
-        models: fields of the objects and the table.
+        models: models of the objects and the table.
         observation: one or more views; masks play no part.
         state: what to render, an estimate from this observation; the pusher is the observation's.
     """
@@ -130,7 +130,7 @@ def goal_allowance(fit: FitQuality, usual: Float[np.ndarray, "N"]) -> Float[np.n
     With shares of the level, the light of the goal may be brighter or dimmer than the scene's.
 
     Args:
-        fit: of a guess of the goal image.
+        fit: fit of a guess of the goal image.
         usual: `relative_residuals` where the objects are now, to the same cameras; not a number where not known.
     """
     shares = np.maximum(_LEAST_SHARE, _SHARE_ALLOWANCE * np.minimum(usual, _MOST_USUAL_SHARE))
@@ -157,7 +157,7 @@ def estimate_with_uncertainty(
     Args:
         params: what was found.
         normals: Gauss-Newton's matrices there, one for each object and one for the light.
-        fit: of the guess.
+        fit: fit of the guess.
         rivals: by object, the best loss of a different orientation over the loss of the one chosen. Where all others
             explain the images far worse, larger residuals are allowed.
         light_held: the light was given, not searched.
@@ -231,7 +231,7 @@ def misfits(fit: FitQuality, allowed: Float[np.ndarray, "N"]) -> list[int]:
     """Return numbers of the objects that the images do not show where they were rendered.
 
     Args:
-        fit: of the guess.
+        fit: fit of the guess.
         allowed: residuals up to which an object's images are not doubted.
     """
     return [n for n in range(len(allowed)) if _misfit(fit, n, allowed[n])]

@@ -253,7 +253,7 @@ def fit_voxels(field: KiloOSF, images: ImageSet, *, steps: int, rays: int, rng: 
     Args:
         field: where to begin; its albedo and its networks are ignored.
         images: what to learn from.
-        steps: of Adam.
+        steps: steps of Adam.
         rays: for each.
         rng: chooses pixels and the offsets of samples.
     """

@@ -123,7 +123,7 @@ class KiloQuery(nn.Module):
             view: unit vectors from the camera into the scene, in the field's frame.
             cell_jitter: in training, how far beyond its own cell a network is asked, in cells: neighbours that have
                 seen the same points agree at their border, so that relighting is smooth across it.
-            generator: of the jitter.
+            generator: random generator of the jitter.
         """
         features = self.features(x)
         albedo, normal, latent = features[:, 1:4], features[:, 4:7], features[:, 7:]

@@ -83,10 +83,10 @@ class OSF(nn.Module):
         """Draw the first weights.
 
         Args:
-            box: of the object: lowest and highest corner [m].
-            size: of the network.
-            generator: of the weights, on the CPU.
-            dtype: of the parameters.
+            box: box of the object: lowest and highest corner [m].
+            size: size of the network.
+            generator: random generator of the weights, on the CPU.
+            dtype: data type of the parameters.
             device: where they live.
         """
         super().__init__()

@@ -106,7 +106,7 @@ def leave_blocks(p, d, inverse, block, distance):  # noqa: ANN001, ANN201
     Args:
         p: where the ray is [voxels].
         d: component of its direction [voxels per unit of t].
-        inverse: of d.
+        inverse: inverse of d.
         block: number of its block on this axis.
         distance: blocks less than this far away are empty (`KiloOSF.macro`).
     """
@@ -179,10 +179,10 @@ def march(
 
     Args:
         field: what the rays meet.
-        origins: of the rays in the field's frame [m].
+        origins: origins of the rays in the field's frame [m].
         directions: unit vectors.
         step: between samples [m].
-        offsets: of each ray's first sample, in steps; 1/2 by default, random in training.
+        offsets: offsets of each ray's first sample, in steps; 1/2 by default, random in training.
         min_weight: samples that would contribute less are left out.
         min_transmittance: where less light passes, a ray ends.
         most: samples a ray at most.
@@ -322,7 +322,7 @@ def first_shell(images: ImageSet, box: Float[np.ndarray, "2 3"], *, across: int,
 
     Args:
         images: whose silhouettes carve.
-        box: of the object [m].
+        box: box of the object [m].
         across: voxels along the longest side of the box.
         cells: tiny networks along the longest side.
         hidden: their width.
@@ -365,7 +365,7 @@ def shell_field(
     Args:
         origin: corner (0, 0, 0) of the grid [m].
         voxel: side of a voxel [m].
-        features: of all corners.
+        features: features of all corners.
         keep: corners that belong to the shell.
         cells: number of the tiny network of each cell.
         networks: parameters of the tiny networks; their width follows from them.
@@ -387,7 +387,7 @@ def reshelled(
     Args:
         field: gives the grid, the networks and the ambient light.
         keep: corners that belong to the shell.
-        features: of all corners; the field's own by default.
+        features: features of all corners; the field's own by default.
     """
     features = field.rows[field.index] if features is None else features
     return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)

@@ -138,7 +138,7 @@ class Distillation(Stage):
 
         Args:
             rays: points lie near what they meet, seen along them; lights are drawn from theirs.
-            share: of the stage that is done, in [0, 1].
+            share: share of the stage that is done, in [0, 1].
             rng: draws points and lights.
             generator: draws the jitter of the cells.
 
@@ -206,7 +206,7 @@ class Distillation(Stage):
         Args:
             field: as it was.
             state: as `state` returned it.
-            size: of the teacher's network.
+            size: size of the teacher's network.
             device: that computes.
         """
         osf = OSF(state["box"].numpy(), size, device=device)
@@ -230,18 +230,18 @@ class Recipe:
     Attributes:
         coarse_across: voxels along the longest side in the first phase.
         fine_across: the same in the second.
-        coarse_share: of the time budget.
+        coarse_share: share of the time budget.
         cells: tiny networks along the longest side.
         hidden: their width.
         rays: pixels per step of descent.
         solid_g: density feature inside the visual hull at first.
         hollow_across: instead of coarse_across for hollow objects: views agree on fine surfaces.
         hollow_g: density feature of the fog around the surfaces on which views agree, from which edges grow.
-        hollow_steps: of descent without networks, before the first phase of a hollow object.
+        hollow_steps: steps of descent without networks, before the first phase of a hollow object.
         hollow_share: instead of coarse_share for hollow objects: opening a hollow takes time.
         coarse_rates: learning rates of the first phase.
-        fine_rates: of the second.
-        teacher_share: of the time budget, in recipe "distil".
+        fine_rates: learning rates of the second.
+        teacher_share: share of the time budget, in recipe "distil".
         distil_share: likewise.
     """
 

@@ -100,7 +100,7 @@ class Stage:
 
         Args:
             rays: with the pixels' colours and opacities.
-            share: of the stage that is done, in [0, 1].
+            share: share of the stage that is done, in [0, 1].
             rng: draws the offsets of the samples along the rays.
             generator: draws the jitter of the cells.
 
@@ -170,7 +170,7 @@ class Checkpoint:
         """Write the checkpoint; the former one stays until the new one is whole.
 
         Args:
-            path: of the file.
+            path: path of the file.
             fingerprint: settings and data of the run, which `read` compares.
 
         Raises:
@@ -264,7 +264,7 @@ class NetworkStage:
 
         Args:
             rays: with the pixels' colours and opacities.
-            share: of the training that is done, in [0, 1].
+            share: share of the training that is done, in [0, 1].
             rng: draws the offsets of the samples along the rays.
             _generator: not needed here; the stages of a KiloOSF draw from it.
 
@@ -435,7 +435,7 @@ class TeacherRecipe:
     """How a teacher is trained.
 
     Attributes:
-        size: of its network.
+        size: size of its network.
         across: voxels of the proposals along the longest side of the box.
         rays: pixels per step of descent.
         rebake: steps between two bakes of the proposals.
@@ -457,7 +457,7 @@ def first_teacher(
 
     Args:
         images: whose silhouettes carve the hull.
-        box: of the object [m].
+        box: box of the object [m].
         recipe: how it learns.
         rng: draws the first weights.
         device: that computes.
@@ -503,7 +503,7 @@ class FieldSettings:
         out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
         minutes: time budget of the descent [min].
         device: "auto", "cpu" or "cuda".
-        seed: of everything random.
+        seed: seed of everything random.
         iterations: instead of the time budget, that many steps: repeatable on one machine.
         teacher_width: units of each layer of the teacher.
         teacher_depth: its layers.

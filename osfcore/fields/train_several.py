@@ -63,10 +63,10 @@ def train_several(
     """Train fields and write each when it is done; what an earlier run has made of the same is left as it is.
 
     Args:
-        settings: of each training; no two write to one place.
+        settings: settings of each training; no two write to one place.
         train: the method, such as `train_field`; can be sent to other processes.
         executor: trains them side by side, if given; else this process does, one after the other, in all its threads.
-        threads: of each training by the executor.
+        threads: threads of each training by the executor.
         shares_disk: whether the executor's workers reach the outputs. Then checkpoints lie beside these, and what a
             worker had begun when it died is gone on with.
 

@@ -40,7 +40,7 @@ class TrainTable:
         data: image set of the bare table; `train` is learned from, `test` measured on.
         out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
         device: "auto", "cpu" or "cuda".
-        seed: of everything random.
+        seed: seed of everything random.
         iterations: steps of descent.
         rays: pixels per step.
     """

@@ -52,7 +52,7 @@ def transmittance(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays sa
     """Return the share of the light that reaches each sample, T_i = exp(-sum of tau_j over j < i).
 
     Args:
-        taus: of samples in order of distance.
+        taus: taus of samples in order of distance.
     """
     return torch.exp(-(torch.cumsum(taus, dim=1) - taus))
 
@@ -86,7 +86,7 @@ def composite(
         rays: R rays.
         min_weight: samples that would contribute less are left out.
         most: samples a ray at most.
-        offsets: of each ray's first sample, in steps; 1/2 by default.
+        offsets: offsets of each ray's first sample, in steps; 1/2 by default.
         device: where `query` computes.
     """
     step = STEP_VOXELS * field.voxel

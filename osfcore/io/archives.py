@@ -106,7 +106,7 @@ class ArchiveKind:
         marker: a file by which its place in the archive is found.
         kept: the folders that belong to it; all that lies beside the marker if empty.
         expected: what should have been given, for messages.
-        max_depth: of folders in it.
+        max_depth: largest depth of folders in it.
     """
 
     what: str
@@ -133,7 +133,7 @@ def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_file
     Args:
         archive: a .zip file.
         out: folder to write; must not exist or be empty.
-        max_bytes: of the unpacked archive.
+        max_bytes: largest size of the unpacked archive.
         max_files: in the archive, folders and what is left packed included.
 
     Returns:
@@ -187,7 +187,7 @@ def unpack(archive: Path, out: Path, kind: ArchiveKind, max_bytes: int = MAX_BYT
         archive: a .zip file.
         out: folder to write; must not exist or be empty.
         kind: what it has to hold.
-        max_bytes: of the unpacked archive.
+        max_bytes: largest size of the unpacked archive.
         max_files: in the archive.
 
     Returns:

@@ -25,7 +25,7 @@ def write_checkpoint(path: Path, fingerprint: object, content: Mapping[str, Any]
     """Write what a run needs to go on; the former checkpoint stays until this one is whole.
 
     Args:
-        path: of the file.
+        path: path of the file.
         fingerprint: settings and data of the run.
         content: tensors, numbers, words, and lists and dicts of them.
 
@@ -79,7 +79,7 @@ def resume_from(path: Path, fingerprint: object, restore: Callable[[dict[str, An
     """Go on from a checkpoint of the same run; a run whose checkpoint is missing, cut short or old starts over.
 
     Args:
-        path: of the file.
+        path: path of the file.
         fingerprint: must be that of the checkpoint.
         restore: gets the content, which lies in main memory.
 
@@ -96,7 +96,7 @@ def read_parameters(path: Path, expected: str, what: str) -> tuple[Mapping[str, 
     """Return metadata and finite parameters of a safetensors file of the expected format.
 
     Args:
-        path: of the file.
+        path: path of the file.
         expected: format that the metadata must name.
         what: kind of network, for messages.
 

@@ -156,7 +156,7 @@ def scratch_folder(parent: Path, prefix: str, life_s: float) -> Iterator[Path]:
 
     Args:
         parent: made if it is not there.
-        prefix: of the folder's name.
+        prefix: prefix of the folder's name.
         life_s: folders of this prefix that have not changed for so long were left by a killed process, and go too [s].
     """
     parent.mkdir(parents=True, exist_ok=True)

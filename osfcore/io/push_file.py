@@ -27,7 +27,7 @@ class Disturbed:
 
     Attributes:
         step: number of the substep in the episode, M of them to an action.
-        positions: of the objects, before [m].
+        positions: positions of the objects, before [m].
         quaternions: likewise, (w, x, y, z).
         linear: velocity of each object's origin, before [m per substep].
         angular: likewise [rad per substep].
@@ -51,12 +51,13 @@ class PushEpisode:
     Attributes:
         names: the objects.
         seed: that made the scene and the actions.
-        positions: of the objects, before the first and after each action [m].
+        positions: positions of the objects, before the first and after each action [m].
         quaternions: likewise, (w, x, y, z).
         pusher: centre of the pusher, likewise [m].
         actions: commanded velocities (vx, vy, 0) [m/s].
         contact: whether the pusher touched the object during the action.
-        sub_positions: of the objects at M equally spaced instants of each action, the last its end [m]; or None.
+        sub_positions: positions of the objects at M equally spaced instants of each action, the last its end [m]; or
+            None.
         sub_quaternions: likewise.
         frames: images of one camera, likewise, or None.
         disturbed: what single substeps would have done from states near the recorded ones, or None.

@@ -42,8 +42,8 @@ class ObjectInfo:
         name: identifier such as "006_mustard_bottle".
         label: name for a person, such as "Mustard bottle".
         mass_kg: mass [kg].
-        symmetry: of its appearance.
-        licence: of the mesh, in SPDX form where there is one.
+        symmetry: symmetry of its appearance.
+        licence: licence of the mesh, in SPDX form where there is one.
         attribution: whom to credit.
     """
 
@@ -79,7 +79,7 @@ class ObjectGeometry:
     """The shape of an object, in its frame.
 
     Attributes:
-        vertices: of its mesh [m].
+        vertices: vertices of its mesh [m].
         faces: vertex indices, counter-clockwise from outside.
         parts: vertices of each convex collision part [m].
     """
@@ -95,7 +95,7 @@ class RestingPoses:
 
     Attributes:
         quaternions: rotation from object frame to a z-up world, (w, x, y, z); any turn about z rests as well.
-        probabilities: of landing so when dropped at random; they sum to 1, largest first.
+        probabilities: probabilities of landing so when dropped at random; they sum to 1, largest first.
     """
 
     quaternions: Float[np.ndarray, "M 4"]

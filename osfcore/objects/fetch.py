@@ -273,7 +273,7 @@ def fetch(
     Each object is written whole or not at all; those finished before a failure stay.
 
     Args:
-        names: of the catalogue; empty for all that the source offers.
+        names: names of the catalogue; empty for all that the source offers.
         source: where the meshes are.
         library: where the objects go; those that it has already are left alone.
         executor: does the conversion, mostly convex decomposition, of several objects at once; None for one by one.
@@ -335,7 +335,7 @@ def convert(path: Path, info: ObjectInfo, library: AssetLibrary, source: str) ->
     """Read one object's mesh, make its collision parts and resting orientations, and write it.
 
     Args:
-        path: of the mesh, as `Source.mesh` returns it.
+        path: path of the mesh, as `Source.mesh` returns it.
         info: the catalogue's facts about the object.
         library: where it goes, over an older one of that name.
         source: where the mesh came from, for people.
@@ -389,7 +389,7 @@ class NewObject:
         mass_kg: in (0, 20] [kg]; None to guess it from the volume.
         label: name for a person; from `name` if empty.
         scale: metres for one unit of the file.
-        licence: of the mesh.
+        licence: licence of the mesh.
     """
 
     name: str

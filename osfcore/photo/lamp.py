@@ -89,7 +89,7 @@ class LampFit:
 
     Attributes:
         direction: unit vector toward the lamp, in the frame of the normals.
-        std: of it, per axis, from the curvature of the residuals [rad].
+        std: its standard deviation, per axis, from the curvature of the residuals [rad].
         strength: light of the lamp on a surface that faces it, per colour, where the radiance of white is 1.
         gain: share of the squared residual of ambient light and harmonics that the lamp explains.
         is_diffuse: nothing speaks for a lamp; the direction then means little.
@@ -106,7 +106,7 @@ def fit_lamp(pixels: ShadedPixels, visible: Visibility = None) -> LampFit:
     """Find the lamp.
 
     Args:
-        pixels: of all objects in one photograph.
+        pixels: pixels of all objects in one photograph.
         visible: share of a lamp's light from a direction that reaches each pixel past objects; all by default.
     """
     weights, grid = np.ones(len(pixels.radiance)), fibonacci_sphere(_DIRECTIONS)
@@ -203,8 +203,8 @@ class Shadows:
     """What objects hide from lamps.
 
     Args:
-        surfels: of each object.
-        poses: of each, in the world.
+        surfels: surfels of each object.
+        poses: poses of each, in the world.
     """
 
     def __init__(self, surfels: Sequence[Surfels], poses: Sequence[Pose]) -> None:
@@ -344,7 +344,7 @@ def object_pixels(photo: Photograph, found: PhotoObject, surfels: Surfels) -> Pi
     Args:
         photo: with a mask of the object.
         found: the object and its pose in the world.
-        surfels: of the object.
+        surfels: surfels of the object.
     """
     window, pose = object_windows([photo], found.name, _MASK_SIDE)[0], found.best.pose
     index, _ = draw(surfels, window, pose[None])
@@ -416,9 +416,9 @@ class LampShape:
     Attributes:
         centre: from which its direction and distance are counted [m].
         direction: unit vector from there toward the lamp.
-        inverse: of the distance [1/m].
+        inverse: inverse of the distance [1/m].
         aim: x and y of the point that it looks at, from the centre [m].
-        radius: of the pool of light around that point, where it ends [m]; None without a cone.
+        radius: radius of the pool of light around that point, where it ends [m]; None without a cone.
         inner_share: the inner half-angle of the cone over the outer one.
     """
 
@@ -569,7 +569,7 @@ class LampSearch:
     """Costs of lamps on the pixels of one scene.
 
     Args:
-        pixels: of the scene.
+        pixels: pixels of the scene.
     """
 
     def __init__(self, pixels: LitPixels) -> None:
@@ -744,8 +744,8 @@ class NearLampFit:
 
     Attributes:
         shape: where it stands and what it looks at.
-        std: of its direction, per axis [rad].
-        log_distance_std: of the logarithm of its distance.
+        std: its standard deviations direction, per axis [rad].
+        log_distance_std: standard deviation of the logarithm of its distance.
         strength: its light on a surface at the centre that faces it, per view and colour, where the radiance of white
             is 1: relative to the exposure, which is unknown. NaN where no object is seen.
         gain: share of the squared residual without a lamp that it explains.
@@ -793,7 +793,7 @@ def fit_near_lamp(pixels: LitPixels, centre: Vector) -> NearLampFit:
     """Find the lamp.
 
     Args:
-        pixels: of all photographs of one scene.
+        pixels: pixels of all photographs of one scene.
         centre: from which its direction and distance are counted [m], such as the table's centre.
     """
     start = _start(pixels, centre)
@@ -869,7 +869,7 @@ def photo_light(photo: Photograph, objects: Sequence[PhotoObject], surfels: Sequ
     Args:
         photo: with masks of the objects.
         objects: what was found in it.
-        surfels: of each object.
+        surfels: surfels of each object.
 
     Raises:
         InvalidInput: if too few pixels show objects that are trusted.
@@ -892,9 +892,9 @@ def photo_lamp(
     Its direction and distance are counted from the world's origin on a known table, else from the objects' centre.
 
     Args:
-        photos: of one scene, with masks of the objects.
+        photos: photos of one scene, with masks of the objects.
         objects: what was found in them.
-        surfels: of each object.
+        surfels: surfels of each object.
         covered_m: sides of a print that lies around the world's origin and hides the table, along x and y [m].
 
     Raises:

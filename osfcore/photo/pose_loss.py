@@ -203,7 +203,7 @@ def compare_poses(
     Args:
         points, normals, albedo, half: surfels, see `draw_surfels`.
         rotations, positions: B x 3 x 3 and B x 3, from the object's frame to the camera's.
-        lens: of the window.
+        lens: lens of the window.
         image, luminance: linear radiance, h x w x 3, and its mean over colours.
         mask, known, plain: pixels of the object; pixels where that is known; well exposed pixels within the mask.
         terms: B x 4, results.
@@ -287,7 +287,7 @@ def surfels_of(field: KiloOSF, spacing: float) -> Surfels:
     """Sample the surface of a field.
 
     Args:
-        field: of the object.
+        field: field of the object.
         spacing: wanted distance between points [m].
     """
     low, high = field.extent
@@ -365,7 +365,7 @@ class ObjectWindow:
             outside the photograph.
         plain: well exposed pixels within the mask, one pixel away from its border.
         signed_distance: to the mask's border, positive inside [px].
-        intrinsics: of the window [px].
+        intrinsics: intrinsics of the window [px].
         T_camera_world: the inverse of the camera's pose.
         cut: share of the mask's border that lies on the photograph's edge.
         frame: which part of the photograph it is.
@@ -404,8 +404,8 @@ def object_windows(photos: Sequence[Photograph], name: str, side: int) -> tuple[
     """Cut a window out of each photograph with a mask of the object.
 
     Args:
-        photos: of one scene.
-        name: of the object.
+        photos: photos of one scene.
+        name: name of the object.
         side: longest side that the mask shall have [px]; smaller masks are not enlarged.
 
     Raises:
@@ -544,7 +544,7 @@ class PoseTerms:
     Attributes:
         iou: intersection over union of drawn outline and mask.
         residual: relative error of the colours.
-        correlation: of the band-passed images.
+        correlation: correlation of the band-passed images.
         losses: the whole.
     """
 
@@ -559,8 +559,8 @@ class PoseLoss:
     """The loss of one object's poses in the world.
 
     Attributes:
-        windows: of the photographs.
-        surfels: of the object.
+        windows: windows of the photographs.
+        surfels: surfels of the object.
         table: prior of the known table; None where it is not known.
         kind: "all", or "iou" for the outline alone, as in the paper.
     """

@@ -282,10 +282,10 @@ def poses_around(pose: Pose, window: ObjectWindow, count: int, rng: np.random.Ge
     """Draw poses around a given one, itself first: about 1.5 cm sideways, 4 % nearer or farther, 15 degrees turned.
 
     Args:
-        pose: of one object in the world.
-        window: of the photograph whose camera says what is sideways.
-        count: of poses.
-        rng: of the draws.
+        pose: pose of one object in the world.
+        window: window of the photograph whose camera says what is sideways.
+        count: number of poses.
+        rng: random generator of the draws.
     """
     depth = (window.T_camera_world @ pose).position[2]
     scales = np.array([_AROUND_LATERAL_M, _AROUND_LATERAL_M, _AROUND_DEPTH_SHARE * depth, *[_AROUND_TURN_RAD] * 3])
@@ -320,7 +320,7 @@ def cma_search(loss: PoseLoss, starts: Pose, spread: float, rng: np.random.Gener
         loss: what is minimised.
         starts: K poses.
         spread: first standard deviation, as a multiple of 2 pixels sideways, 3 % of the depth and 0.15 rad.
-        rng: of the searches.
+        rng: random generator of the searches.
 
     Returns:
         The best pose of each search and its loss.
@@ -361,7 +361,7 @@ class TableGuess:
 
     Attributes:
         T_world_camera: such that it is z = 0, its origin below the objects' mean.
-        spread_deg: of the objects' verticals around their mean, root mean square.
+        spread_deg: spread of the objects' verticals around their mean, root mean square.
         supported: numbers of the objects that lie on it.
     """
 
@@ -377,8 +377,8 @@ def table_from_objects(priors: Sequence[TablePrior], poses: Sequence[Pose]) -> T
     at the median of their lowest points, of which those within 2 cm count.
 
     Args:
-        priors: of each object.
-        poses: of each object in the camera's frame.
+        priors: priors of each object.
+        poses: poses of each object in the camera's frame.
     """
     options = [prior.downs(pose) for prior, pose in zip(priors, poses, strict=True)]
     options = [o[o @ _DOWNWARD > 0] for o in options]
@@ -524,7 +524,7 @@ def table_from_points(points_camera: Float[np.ndarray, "P 3"], rng: np.random.Ge
 
     Args:
         points_camera: most of them on the table, in the camera's frame [m].
-        rng: of the draws.
+        rng: random generator of the draws.
 
     Raises:
         InvalidInput: if there are fewer than 50 points, or less than 30 % lie on one plane.
@@ -560,10 +560,10 @@ class PhotoPose:
 
     Attributes:
         pose: `T_world_object`.
-        loss: of `PoseLoss`.
-        iou: of drawn outline and mask.
+        loss: loss of `PoseLoss`.
+        iou: intersection over union of drawn outline and mask.
         residual: relative error of the colours.
-        correlation: of the band-passed images.
+        correlation: correlation of the band-passed images.
     """
 
     pose: Pose
@@ -578,12 +578,12 @@ class PhotoObject:
     """One object that was looked for.
 
     Attributes:
-        name: of the object.
+        name: name of the object.
         best: the most likely pose.
         rivals: other orientations, the best first; a person may choose one.
         doubt: why it should not be trusted, in a sentence; "" where it may be.
         coarse_s: duration of the search over rotations [s].
-        refine_s: of the refinement [s].
+        refine_s: duration of the refinement [s].
     """
 
     name: str
@@ -633,7 +633,7 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
     """Return the first reason for doubt that applies; "" if none does.
 
     Args:
-        name: of the object.
+        name: name of the object.
         best: its pose.
         rivals: other orientations, the best first.
         loss: whose windows the pose was found in.
@@ -666,9 +666,9 @@ def without_others(
 
     Args:
         photos: with masks.
-        name: of the object; photographs without a mask of it are left as they are.
+        name: name of the object; photographs without a mask of it are left as they are.
         found: all objects.
-        surfels: of each object, by name.
+        surfels: surfels of each object, by name.
     """
     seen = []
     for photo in photos:
@@ -766,10 +766,10 @@ def estimate_photo(
     """Find objects one after the other; the last step holds all.
 
     Args:
-        models: of the objects.
-        photos: of one scene; each object has a mask in at least one.
-        names: of the objects.
-        rng: of the searches.
+        models: models of the objects.
+        photos: photos of one scene; each object has a mask in at least one.
+        names: names of the objects.
+        rng: random generator of the searches.
         config: how to look.
 
     Raises:

@@ -48,7 +48,7 @@ class RawPhotograph:
 
     Attributes:
         encoded: values as the file holds them, in the primaries of sRGB; perhaps scaled down.
-        encoding: of these values.
+        encoding: encoding of these values.
         sent_size: width and height of the upright photo as it was sent [px].
         focal_px: focal length in pixels of `encoded`, from EXIF; None if that lacks it.
         notes: sentences for the user about what was done to the photo.

@@ -37,9 +37,9 @@ def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModel
     """Summarise an estimation.
 
     Args:
-        photos: of one table.
+        photos: photos of one table.
         step: the last one.
-        models: of the objects.
+        models: models of the objects.
         notes: sentences for the user about the photo.
     """
     T_table_world, table, notes = Pose.identity(), "board" if photos[0].on_table else None, list(notes)
@@ -121,7 +121,7 @@ class Located:
         raw: free of distortion.
         intrinsics: K of `raw` [px].
         lens: that was found.
-        source: of the focal length.
+        source: source of the focal length.
         T_world_camera: pose over the board; None if there is none.
         notes: sentences for the user about photo and camera.
         missing: why no board was found; "" where one was.

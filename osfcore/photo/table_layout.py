@@ -32,7 +32,7 @@ class TableLayout:
     """What was found in a photograph, on our table.
 
     Attributes:
-        poses: of the objects, by name.
+        poses: poses of the objects, by name.
         T_table_photo: where the photograph's table frame lies.
         T_table_camera: pose of the camera.
         light: the lamp; overhead where nothing speaks for one.

@@ -40,8 +40,8 @@ class FreeSpace:
         """Draw the objects.
 
         Args:
-            outlines: of their convex parts, seen from above [m].
-            radius: of the disc [m].
+            outlines: outlines of their convex parts, seen from above [m].
+            radius: radius of the disc [m].
         """
         solid = np.zeros((_SIDE, _SIDE), np.uint8)
         for outline in outlines:

@@ -58,7 +58,7 @@ class Stage:
     """An object and where it is brought to.
 
     Attributes:
-        number: of the object.
+        number: index of the object.
         target: its pose then.
     """
 
@@ -81,7 +81,7 @@ def push_orders(
         goals: where they should be.
         off: numbers of those that are not there.
         outlines: returns those of an object at a pose [m].
-        count: of orders at most.
+        count: number of orders at most.
         rng: draws among possible ones.
     """
     waits = _dependencies(now, goals, off, outlines)
@@ -218,10 +218,10 @@ class PushOutcomes:
     """P straight pushes and where each has brought the object after S lengths, in the object's planar frame.
 
     Attributes:
-        starts: of the pusher's centre, clear of the object [m].
+        starts: starts of the pusher's centre, clear of the object [m].
         directions: unit vectors.
-        lengths: of the way from the start [m].
-        centres: of mass [m].
+        lengths: lengths of the way from the start [m].
+        centres: centres of mass [m].
         quaternions: orientations.
         loop: a way around the object, clear of it, counterclockwise [m].
     """
@@ -244,9 +244,9 @@ def push_outcomes(
 
     Args:
         predict: predicts what pushes do; without it, the table is empty.
-        state: of a scene with this object alone.
-        centre: of mass, in the object's frame [m].
-        outlines: of its convex parts seen from above [m].
+        state: state of a scene with this object alone.
+        centre: centre of mass, in the object's frame [m].
+        outlines: outlines of its convex parts seen from above [m].
     """
     pose = state.poses[0]
     origin = pose.apply(centre)[:2]
@@ -360,7 +360,7 @@ def straight_pushes(
     """Draw straight pushes that bring an object about as far as it has to go.
 
     Args:
-        outline: of the object from above, points all along it, see `outline_points` [m].
+        outline: outline of the object from above, points all along it, see `outline_points` [m].
         offset: how far it has to go [m], not zero.
         count: how many to draw.
         rng: draws directions, places beside the middle and lengths.
@@ -414,11 +414,11 @@ class PushStage:
     """Actions that bring an object nearer to its goal.
 
     Attributes:
-        number: of the object.
+        number: index of the object.
         actions: velocities of the pusher [m/s].
         start: where the pusher begins [m].
         end: where it ends [m].
-        pose: of the object then.
+        pose: pose of the object then.
         gain: what is taken from the sum of the objects' costs [m].
     """
 
@@ -437,9 +437,9 @@ def recombined(
 
     Args:
         rollouts: futures of those, from one state.
-        costs: of each object in them, before the first and after each action [m].
+        costs: costs of each object in them, before the first and after each action [m].
         outlines: returns those of an object at a pose [m].
-        count: of sequences at most; fewer or none come back where no stage brings anything nearer.
+        count: number of sequences at most; fewer or none come back where no stage brings anything nearer.
     """
     horizon = rollouts.positions.shape[1] - 1
     pusher = rollouts.pusher[0, 0, :2]
@@ -454,7 +454,7 @@ def push_stages(rollouts: Rollouts, costs: Float[np.ndarray, "K T1 N"]) -> dict[
 
     Args:
         rollouts: futures from one state.
-        costs: of each object in them, before the first and after each action [m].
+        costs: costs of each object in them, before the first and after each action [m].
     """
     moves = _moves(rollouts)
     horizon, total = moves.shape[1], costs.sum(axis=2)
@@ -596,7 +596,7 @@ class ObjectPushes:
     Args:
         outcomes: table of its pushes on that side.
         reference: orientation that the table was made in.
-        centre: of mass, in the object's frame [m].
+        centre: centre of mass, in the object's frame [m].
     """
 
     def __init__(
@@ -630,12 +630,12 @@ class ObjectPushes:
         """Sequences of up to three pushes that bring the object nearer.
 
         Args:
-            pose: of the object, on the side that the table was made for.
+            pose: pose of the object, on the side that the table was made for.
             goal: where it should be.
             later: pushes on the side that the goal shows: these ones, or others if that is another side.
             space: where first pushes may begin.
             pusher: where it comes from [m].
-            count: of sequences at most; fewer or none where no push that has room brings the object nearer.
+            count: number of sequences at most; fewer or none where no push that has room brings the object nearer.
             rng: draws them.
         """
         yaw, centre = self.yaw(pose) or 0.0, pose.apply(self._centre)[:2]
@@ -748,10 +748,10 @@ class _FirstPushes:
     """Some rows of a table, and what they lead to.
 
     Attributes:
-        rows: of the table.
+        rows: rows of the table.
         motions: shift in the planar frame before, and turn from it to the planar frame of later pushes [m, rad].
         tilts: from the side that the goal shows [rad].
-        angles: of the whole rotation to the goal [rad].
+        angles: angles of the whole rotation to the goal [rad].
     """
 
     rows: Int[np.ndarray, "M"]
@@ -855,7 +855,8 @@ class PushProposals:
 
     Example:
         >>> proposals = PushProposals(load_shapes(None, fields, [name]))
-        >>> actions = proposals.draw(state, goal, count=20, horizon=30, rng=np.random.default_rng(0))
+        >>> rng = np.random.default_rng(0)
+        >>> actions = proposals.draw(state, goal, count=20, horizon=30, rng=rng)
         >>> actions.shape[1:]  # 30 velocities (vx, vy, 0) [m/s]
         (30, 3)
     """

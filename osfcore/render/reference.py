@@ -133,7 +133,7 @@ def solid_field(
     Args:
         depth: how deep points lie inside the solid, negative outside [m].
         normal: outward unit vectors at points near the surface.
-        half_size: of its box around the origin [m].
+        half_size: half size of its box around the origin [m].
         albedo: its reflectance.
         voxel: side of the voxels [m].
         hidden: width of the (empty) networks: that of the fields it is drawn with.

@@ -40,7 +40,7 @@ class Packed(NamedTuple):
         extents: N x 6: lowest and highest corner of the occupied part [m].
         ambient: N x 3.
         hidden: width of the networks, the same for all.
-        parameters: of one network.
+        parameters: parameters of one network.
     """
 
     density: np.ndarray
@@ -136,7 +136,7 @@ def place_lamps(
         pack: the fields.
         numbers: which of them each object has.
         rotations: from the world into each object's frame.
-        positions: of the objects [m].
+        positions: positions of the objects [m].
         table: what they shine on; None if there is none.
     """
     scales = pack.scales[numbers].astype(float)

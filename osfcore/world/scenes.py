@@ -111,7 +111,7 @@ def place_randomly(
 
     Args:
         physics: a simulation of these objects; it starts over.
-        assets: of the objects, by name.
+        assets: assets of the objects, by name.
         rng: draws poses and places.
         is_upright: objects stand upright, as their meshes do; one that falls over rests as it fell.
 
@@ -147,8 +147,8 @@ def refuse_overlaps(physics: Physics, names: tuple[str, ...], moved: str | None 
     """Raise if bodies penetrate by more than 2 mm.
 
     Args:
-        physics: of the bodies.
-        names: of the objects.
+        physics: physics of the bodies.
+        names: names of the objects.
         moved: check only pairs with this object; None for all.
 
     Raises:

@@ -18,9 +18,9 @@ def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None =
     """Connect to the robot at an address.
 
     Args:
-        url: of a robot over HTTP, or of rosbridge with the names of ROS in its query (`RosNames`).
-        names: of the objects on the table.
-        limits: of a robot under ROS, which has no message for them; the usual ones if None.
+        url: address of a robot over HTTP, or of rosbridge with the names of ROS in its query (`RosNames`).
+        names: names of the objects on the table.
+        limits: limits of a robot under ROS, which has no message for them; the usual ones if None.
 
     Raises:
         InvalidInput, UnknownName: if the address is malformed.

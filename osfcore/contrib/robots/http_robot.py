@@ -49,11 +49,11 @@ class SentCamera:
     """A camera as a robot describes it: of any image size.
 
     Attributes:
-        name: of the camera.
+        name: name of the camera.
         T_world_camera: its pose over the table.
         intrinsics: K of the pictures that are sent, pixel centres at +0.5 [px].
-        width: of the pictures that are sent [px].
-        height: of the pictures that are sent [px].
+        width: width of the pictures that are sent [px].
+        height: height of the pictures that are sent [px].
         distortion: coefficients of OpenCV's model; none for a pinhole camera.
     """
 
@@ -123,7 +123,7 @@ def observation_of(
     Args:
         cameras: that took the pictures.
         pictures: one file of each camera.
-        names: of the objects, given by the owner.
+        names: names of the objects, given by the owner.
         pusher: its centre [m].
         time_s: since the robot was connected [s].
         masks: files by names of camera and object; objects without a file are not visible. None without masks.
@@ -169,7 +169,7 @@ class HttpRobot:
 
     Args:
         url: its address, such as http://192.168.0.7:8080.
-        names: of the objects on the table, given by a person.
+        names: names of the objects on the table, given by a person.
         timeout_s: how long an answer may take, to its last byte and beyond the time that a motion takes [s].
 
     Raises:
@@ -287,7 +287,7 @@ class HttpRobot:
         """Send a request and wait for the answer.
 
         Args:
-            method: of HTTP.
+            method: HTTP method.
             path: below the robot's address.
             body: what is sent as JSON.
             most: bytes of the answer.

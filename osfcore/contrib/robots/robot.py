@@ -27,7 +27,7 @@ class SafetyLimits:
 
     Attributes:
         box: x0, y0, x1, y1 [m].
-        top_speed_m_s: of the pusher, in any direction [m/s].
+        top_speed_m_s: top speed of the pusher, in any direction [m/s].
     """
 
     box: tuple[float, float, float, float] = (-PUSHER_REACH_M, -PUSHER_REACH_M, PUSHER_REACH_M, PUSHER_REACH_M)
@@ -70,7 +70,7 @@ class SafetyLimits:
             min(t, high - where.high) >= 0 for t > 0, max(t, low - where.low) <= 0 for t < 0.
 
         Args:
-            travel: of the pusher [m].
+            travel: travel of the pusher [m].
             where: the pusher is.
         """
         low, high = np.reshape(self.box, (2, 2))
@@ -166,7 +166,7 @@ class ConnectionLost(OsfError):
     """A robot that no longer answers; it halts by itself.
 
     Args:
-        url: of the robot.
+        url: address of the robot.
         reason: what happened.
     """
 
@@ -180,7 +180,7 @@ class RobotRefused(OsfError):
     """A robot's answer to a request that it refuses, or an answer that cannot be read.
 
     Args:
-        url: of the robot.
+        url: address of the robot.
         reason: a sentence.
     """
 
@@ -196,7 +196,7 @@ class RobotDescription:
     Attributes:
         cameras: with their poses over the table.
         limits: that it keeps by itself.
-        pusher_radius_m: of its pusher, a vertical cylinder [m].
+        pusher_radius_m: radius of its pusher, a vertical cylinder [m].
         deadman_s: without a new command it halts after this time [s].
         masks: objects whose masks it delivers.
     """

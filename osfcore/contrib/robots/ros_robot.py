@@ -72,7 +72,7 @@ class TransformTree:
     """The frames of ROS by `T_parent_child`; later messages replace earlier ones.
 
     Args:
-        messages: of /tf and /tf_static, the older first.
+        messages: messages of /tf and /tf_static, the older first.
 
     Raises:
         InvalidInput: if a message is malformed.
@@ -128,7 +128,7 @@ class Rosbridge:
     """One connection, with a thread that receives messages.
 
     Args:
-        url: of rosbridge's websocket, ws://host:port.
+        url: address of rosbridge's websocket, ws://host:port.
         timeout_s: how long opening and closing may take [s].
 
     Raises:
@@ -157,7 +157,7 @@ class Rosbridge:
 
         Args:
             topic: its name.
-            kind: of its messages, such as sensor_msgs/msg/CameraInfo.
+            kind: type of its messages, such as sensor_msgs/msg/CameraInfo.
             every_ms: least time between two messages [ms].
             kept: how many of the last messages are kept, if they are not too large together.
         """
@@ -313,10 +313,10 @@ class RosRobot:
     """A `Robot` under ROS; `description` has the cameras that ROS publishes, and the limits that were given.
 
     Args:
-        url: of rosbridge's websocket, ws://host:9090.
+        url: address of rosbridge's websocket, ws://host:9090.
         topics: and frames.
-        names: of the objects on the table, given by a person.
-        limits: of this robot, for which ROS has no message.
+        names: names of the objects on the table, given by a person.
+        limits: limits of this robot, for which ROS has no message.
         timeout_s: how long pictures and calibration may take [s].
 
     Raises:
