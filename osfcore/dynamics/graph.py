@@ -265,7 +265,7 @@ class Inputs(NamedTuple):
     """A graph in numbers.
 
     Attributes:
-        nodes: nodes of each object.
+        nodes: features of each object.
         edges: from the pusher to the objects it can touch, then between objects.
         receiver: object at the end of each edge.
         sender: object at the beginning of each edge between objects.

@@ -97,7 +97,7 @@ class Memory(namedtuple("Memory", "nodes edges receiver sender own state effect 
         nodes, edges: features, `NODE_WIDTH` and `EDGE_WIDTH` a row.
         receiver, sender: node at the end and at the beginning of each edge, -1 for the pusher.
         own, state, effect: of nodes.
-        relation: relation of edges.
+        relation: state of edges.
         a, b, c: of nodes or edges.
         motion: the answer, `MOTION_WIDTH` a row.
     """

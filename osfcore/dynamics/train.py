@@ -360,8 +360,8 @@ class _Rows:
 
     Attributes:
         values: the rows.
-        first: first of each graph.
-        count: number of each graph.
+        first: index of the first row of each graph.
+        count: number of rows of each graph.
     """
 
     values: Tensor
@@ -807,7 +807,7 @@ class TrainDynamics:
         long_iterations: on windows of three actions, after these.
         long_batch: windows in each.
         hidden: width of the network.
-        rate: highest learning rate; on windows a tenth of it; of what is no matrix half of it.
+        rate: highest learning rate; on windows a tenth of it, and for parameters that are no matrices half of it.
         patience: measurements on held-out episodes without a better one after which training stops.
         without: objects whose episodes are left out.
         device: "auto", "cpu" or "cuda".

@@ -1,4 +1,4 @@
-"""What an estimate minimises: parameters of a scene, models of objects and table, losses of paper eq. 5 and 6."""
+"""The objective of an estimate: scene parameters, models of objects and table, and the losses of paper eq. 5 and 6."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class SceneParameters:
 
     Attributes:
         names: names of the N objects.
-        positions: positions of the objects [m].
-        quaternions: unit.
+        positions: positions of the objects in the world [m].
+        quaternions: orientations of the objects in the world as unit quaternions (w, x, y, z).
         light: unit vector toward the light.
-        pusher: its centre [m], or None.
+        pusher: centre of the pusher in the world [m], or None.
     """
 
     names: tuple[str, ...]
@@ -55,7 +55,7 @@ class SceneParameters:
 
     @staticmethod
     def of(state: SceneState, pusher: Float[np.ndarray, "3"] | None) -> SceneParameters:
-        """The objects and the light of a state, with this pusher."""
+        """Return the parameters of a state, with this pusher."""
         return SceneParameters(state.names, state.poses.position, state.poses.quaternion, state.light.direction, pusher)
 
     @property
@@ -64,17 +64,17 @@ class SceneParameters:
         return POSE * len(self.names) + LIGHT
 
     def pose(self, number: int) -> Pose:
-        """`T_world_object` of one object."""
+        """Return `T_world_object` of one object."""
         return Pose(self.positions[number], self.quaternions[number])
 
     def with_pose(self, number: int, pose: Pose) -> SceneParameters:
-        """The scene with one object in another pose `T_world_object`."""
+        """Return the scene with one object in another pose `T_world_object`."""
         positions, quaternions = self.positions.copy(), self.quaternions.copy()
         positions[number], quaternions[number] = pose.position, pose.quaternion
         return replace(self, positions=positions, quaternions=quaternions)
 
     def state(self) -> SceneState:
-        """The scene as a state."""
+        """Return the scene as a state."""
         return SceneState(self.names, Pose(self.positions, self.quaternions), Light(self.light), self.pusher)
 
     def perturbed(self, changes: Float[np.ndarray, "B P"]) -> SceneBatch:
@@ -97,7 +97,7 @@ class SceneParameters:
         return replace(self, positions=batch.positions[0], quaternions=batch.quaternions[0], light=batch.lights[0])
 
     def repeated(self, count: int = 1) -> SceneBatch:
-        """Return a batch of the scene itself, `count` times."""
+        """Return a batch with `count` copies of the scene."""
         return self.perturbed(np.zeros((count, self.size)))
 
 
@@ -106,11 +106,11 @@ def empty_scene(light: Float[np.ndarray, "3"]) -> SceneBatch:
     return SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), light[None], None)
 
 
-# How an object can lie on a table, from its field alone.
+# The resting orientations of an object, from its field alone.
 #
-# The height of the centre of mass over the table is a function of the direction that points down. Where it has a
-# minimum the object lies stably; where it hardly changes from one direction to the next, as for a can on its side,
-# every one of them is kept.
+# The height of the centre of mass over the table is a function of the direction that points down. At a minimum of it
+# the object lies stably. Where the height hardly changes between neighbouring directions, as for a can on its side, all
+# of them are kept.
 
 
 _OPAQUE_G = 2.0  # density feature above which a corner counts as solid
@@ -160,15 +160,15 @@ class RestingOrientations:
 
     @property
     def origin_heights(self) -> Float[np.ndarray, "K"]:
-        """Height of the object's origin above the table in each orientation [m]."""
+        """Return the height of the object's origin above the table in each orientation [m]."""
         return self.heights - rotate(self.quaternions, self.centre)[:, 2]
 
     def lowest(self, pose: Pose) -> float:
-        """Height of the lowest point of the object in a pose [m]."""
+        """Return the height of the lowest point of the object in a pose [m]."""
         return float(pose.apply(self.hull)[:, 2].min())
 
     def poses_at(self, centres: Float[np.ndarray, "... 3"], quaternions: Float[np.ndarray, "K 4"]) -> Pose:
-        """Return K poses in given orientations whose centres of mass lie at one place or at K places [m]."""
+        """Return K poses in these orientations, with the centres of mass at one place or at K places [m]."""
         return Pose(centres - rotate(quaternions, self.centre), quaternions)
 
 
@@ -195,7 +195,7 @@ def full_circle(steps: int) -> Float[np.ndarray, "steps 4"]:
 
 
 def _solid(field: DensityGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices of the convex hull of what is opaque, and the hull's centre of mass."""
+    """Return the vertices and the centre of mass of the convex hull of the opaque corners."""
     solid = np.argwhere(field.density > min(_OPAQUE_G, float(field.density.max()) - 1))
     points = field.origin + field.voxel * solid
     hull = ConvexHull(points, qhull_options="QJ")  # joggled: a flat or degenerate field still has a hull
@@ -208,7 +208,7 @@ def _solid(field: DensityGrid) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _stable(directions: np.ndarray, heights: np.ndarray) -> list[int]:
-    """Directions that are (almost) the lowest around them, thinned out, the lowest first."""
+    """Return directions that are (almost) the lowest among their neighbours, thinned out, the lowest first."""
     cosines = directions @ directions.T
     lowest = np.where(cosines > np.cos(np.deg2rad(_NEIGHBOURHOOD_DEG)), heights, np.inf).min(axis=1)
     candidates = np.flatnonzero(heights <= lowest + _SLACK_M)
@@ -220,7 +220,7 @@ def _stable(directions: np.ndarray, heights: np.ndarray) -> list[int]:
 
 
 def _rotation_downwards(direction: np.ndarray) -> np.ndarray:
-    """A rotation that takes a unit vector to (0, 0, -1)."""
+    """Return a rotation that takes a unit vector to (0, 0, -1)."""
     axis = np.cross(direction, (0.0, 0.0, -1.0))
     sine = np.linalg.norm(axis)
     if sine < 1e-9:  # along the vertical already
@@ -228,7 +228,7 @@ def _rotation_downwards(direction: np.ndarray) -> np.ndarray:
     return quaternion_exp(axis / sine * np.arctan2(sine, -direction[2]))
 
 
-# What is known before any image: how each object looks, how it can lie, and how the table looks.
+# Known before any image: how each object looks, how it can lie, and how the table looks.
 
 
 QUALITY: Quality = PLANNING
@@ -371,8 +371,8 @@ class ObservedViews:
         images: linear RGB.
         masks: share of each pixel that shows each object, or None.
         pusher: centre of the pusher [m], or None.
-        quality: quality of what is rendered to compare with.
-        only: pixels that count, where not all do.
+        quality: quality of the renderings that are compared with the images.
+        only: pixels that are compared; None for all.
     """
 
     cameras: tuple[Camera, ...]
@@ -384,11 +384,11 @@ class ObservedViews:
 
 
 def views_of(observation: Observation, side: int, *, samples: int = 1) -> ObservedViews:
-    """An observation at the resolution at which it is compared with renderings.
+    """Return an observation at the resolution at which it is compared with renderings.
 
     Args:
-        observation: images are reduced by area averaging, never enlarged.
-        side: longest side of the result [px]; the other does not fall below 16 px.
+        observation: the observation. Its images are reduced by area averaging, never enlarged.
+        side: longest side of the result [px]. The other side is at least 16 px.
         samples: rays along each side of a rendered pixel.
     """
     height, width = observation.images.shape[1:3]
@@ -410,15 +410,15 @@ def _resize(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ObjectView:
-    """The windows of V views around one object; all of one size.
+    """Windows of V views around one object, all of one size.
 
     Attributes:
-        cameras: that see the windows alone.
+        cameras: cameras that see only the windows.
         rgb: the object over black (paper eq. 5: image times mask).
         mask: share of each pixel that shows it.
         valid: pixels in which no other object hides it.
         area: area of the mask [px]; at least 1.
-        quality: quality of what is rendered to compare with.
+        quality: quality of the renderings that are compared with the windows.
     """
 
     cameras: tuple[Camera, ...]
@@ -430,10 +430,10 @@ class ObjectView:
 
 
 def crop_to_masks(views: ObservedViews, number: int) -> ObjectView:
-    """The windows around one object's masks.
+    """Return the windows around the masks of one object.
 
     Args:
-        views: with masks; views in which the object's is empty are left out, and at least one must not be.
+        views: images with masks. Views with an empty mask of the object are left out; at least one must not be empty.
         number: index of the object.
     """
     assert views.masks is not None
@@ -457,14 +457,14 @@ def crop_to_masks(views: ObservedViews, number: int) -> ObjectView:
 def crop_to_object(
     views: ObservedViews, models: ObjectModels, params: SceneParameters, number: int, *, reach: float = 0.0
 ) -> ObservedViews:
-    """The windows around one object of a guess, without masks, or whole images if none shows it.
+    """Return the windows around one object of a guess, without masks; whole images if none shows it.
 
     Args:
-        views: whole images; those that do not show the object are left out.
-        models: fields, for the object's bounding sphere.
+        views: whole images. Those that do not show the object are left out.
+        models: models of the objects, for the bounding sphere.
         params: guess of the scene.
         number: index of the object.
-        reach: by how much the windows reach beyond that sphere [m].
+        reach: margin of the windows around that sphere [m].
     """
     radius, centre = models.resting(params.names[number]).radius, models.centre_of_mass(params, number)
     height, width = views.images.shape[1:3]
@@ -491,11 +491,11 @@ def crop_to_object(
 def crop_to_silhouette(
     views: ObservedViews, models: ObjectModels, params: SceneParameters, number: int
 ) -> ObservedViews:
-    """The windows around one object of a guess, of which only pixels in or just beside its silhouette count.
+    """Return the windows around one object of a guess, in which only pixels at its silhouette count.
 
     Args:
         views: whole images.
-        models: fields; the object is rendered alone for its silhouette.
+        models: models of the objects, to render the silhouette.
         params: guess of the scene.
         number: index of the object.
     """
@@ -511,12 +511,12 @@ def crop_to_silhouette(
 
 
 def crop_camera(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
-    """The camera that sees a window of another's image.
+    """Return a camera that sees only a window of another camera's image.
 
     Args:
-        camera: the other.
+        camera: the other camera.
         x: left edge of the window in its image [px]; may lie outside.
-        y: upper edge likewise [px].
+        y: upper edge of the window [px]; may lie outside.
         width: width of the window [px].
         height: height of the window [px].
 
@@ -529,7 +529,7 @@ def crop_camera(camera: Camera, x: int, y: int, width: int, height: int) -> Came
 
 
 def _crop_windows(masks: Bool[np.ndarray, "V h w"]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Corners (x, y) of windows around masks, none of them empty, and their common width and height [px]."""
+    """Return corners (x, y) of windows around masks that are not empty, and their common width and height [px]."""
     height, width = masks.shape[1:]
     boxes = []
     for mask in masks:
@@ -552,7 +552,7 @@ HUBER = 0.1  # h [radiance]
 
 
 def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> Float32[np.ndarray, "B V h w 3"]:
-    """Rendered minus observed [radiance]; 0 where pixels do not count.
+    """Return rendered minus observed images [radiance]; 0 at pixels that do not count.
 
     Args:
         models: models of the objects and the table.
@@ -564,18 +564,18 @@ def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> 
 
 
 def photometric_loss(errors: Float[np.ndarray, "B *pixels"]) -> Float[np.ndarray, "B"]:
-    """Mean Huber loss over all pixels and colours of each scene.
+    """Return the mean Huber loss over all pixels and colours of each scene.
 
     rho(r) = r^2 / 2 for |r| < h, h (|r| - h / 2) otherwise, with h = HUBER.
 
-    Deviation from paper eq. 6, the mean square: outliers such as specular highlights count linearly.
+    Deviation from paper eq. 6, which is the mean square: outliers such as specular highlights count linearly.
     """
     size = np.abs(errors.reshape(len(errors), -1))
     return np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER)).mean(axis=1, dtype=float)
 
 
 def loss_of(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
-    """Photometric loss of one scene.
+    """Return the photometric loss of one scene.
 
     Args:
         models: models of the objects and the table.
@@ -588,12 +588,12 @@ def loss_of(models: ObjectModels, views: ObservedViews, params: SceneParameters)
 def pose_losses(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, number: int, poses: Pose
 ) -> Float[np.ndarray, "K"]:
-    """Photometric loss of a scene with one object in each of K poses.
+    """Return the photometric loss of a scene with one object in each of K poses.
 
     Args:
         models: models of the objects and the table.
-        views: images to compare with, whole ones or windows around the object.
-        params: the guess; all other objects and the light stay.
+        views: images to compare with: whole images or windows around the object.
+        params: the guess, in which all other objects and the light stay.
         number: index of the object.
         poses: the K poses, a batch of `T_world_object`.
     """
@@ -616,7 +616,7 @@ class RenderedObject:
     """Renderings of one object in B poses, cropped as its `ObjectView`.
 
     Attributes:
-        rgb: over black.
+        rgb: linear radiance of the object over black.
         opacity: share of each pixel that shows it.
     """
 
@@ -644,20 +644,21 @@ def render_poses(
 
 
 def masked_loss(look: RenderedObject, part: ObjectView, *, any_brightness: bool = False) -> Float[np.ndarray, "B"]:
-    """Silhouette and colour error of each pose; 0 is perfect.
+    """Return the silhouette and colour error of each pose; 0 is perfect.
 
     With rendered opacity o, mask m, validity v, the mask's area A in each view, and P the pixels of both silhouettes:
 
         L = sum_views A / sum(A) * [ sum |o - m| v / A  +  w * sum_P min(|c_rendered - c_observed|, e_max) / A ]
 
-    Deviations from paper eq. 5, the mean squared error inside the masks: absolute errors, truncated at e_max, so that
-    shadows of other objects, which are not rendered here, do not decide; the silhouette is a term of its own; pixels
-    that other objects may cover are left out.
+    Deviations from paper eq. 5, the mean squared error inside the masks: errors are absolute and truncated at e_max, so
+    that shadows of other objects, which are not rendered here, have little weight. The silhouette has a term of its
+    own. Pixels that other objects may cover are left out.
 
     Args:
         look: rendered images of B poses.
         part: the observed crop of each view.
-        any_brightness: scale colours by the least-squares factor of each pose and view: the light is not known yet.
+        any_brightness: whether to scale colours by the least-squares factor of each pose and view, because the light is
+            not known yet.
 
     Returns:
         The loss of each pose.

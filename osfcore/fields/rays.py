@@ -106,7 +106,7 @@ def leave_blocks(p, d, inverse, block, distance):  # noqa: ANN001, ANN201
     Args:
         p: where the ray is [voxels].
         d: component of its direction [voxels per unit of t].
-        inverse: inverse of d.
+        inverse: 1 / d.
         block: number of its block on this axis.
         distance: blocks less than this far away are empty (`KiloOSF.macro`).
     """

@@ -218,7 +218,7 @@ class PushOutcomes:
     """P straight pushes and where each has brought the object after S lengths, in the object's planar frame.
 
     Attributes:
-        starts: starts of the pusher's centre, clear of the object [m].
+        starts: position of the pusher's centre at the start, clear of the object [m].
         directions: unit vectors.
         lengths: lengths of the way from the start [m].
         centres: centres of mass [m].
