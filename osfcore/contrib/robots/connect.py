@@ -1,4 +1,4 @@
-"""Robots by address."""
+"""Connections to robots by address."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None =
     Raises:
         InvalidInput, UnknownName: if the address is malformed.
         MissingExtra: if a package for ROS is not installed.
-        ConnectionLost: if nobody answers.
-        RobotRefused: if what answers is no robot.
+        ConnectionLost: if there is no answer.
+        RobotRefused: if the answer does not come from a robot.
     """
     parts = check_address(url)
     host, port = parts.hostname or "", parts.port
