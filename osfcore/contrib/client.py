@@ -554,7 +554,7 @@ class Client:
         return tuple(decode(Episode, one, "episode") for one in self._service.json("GET", "/api/episodes")["episodes"])
 
     def cancel(self, running: Episode | Estimate) -> None:
-        """Cancel an episode or an estimate. The table stays as the episode left it.
+        """Cancel an episode or an estimate. The steps of an episode so far are kept.
 
         Raises:
             ServiceError: if the job has already ended.

@@ -1,6 +1,6 @@
 """Rollouts of many scenes, compiled for the CPU: contacts, features, network and motion of each substep.
 
-The same numbers as `graph.py` in PyTorch, which training needs for its gradients; `rollout.py` alone calls it.
+It computes the same as `graph.py` in PyTorch, which training needs for its gradients. Only `rollout.py` calls it.
 """
 
 # ruff: noqa: ANN001, ANN201, ANN202, D417 - compiled helpers; types are given by their callers

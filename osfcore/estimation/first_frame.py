@@ -15,6 +15,7 @@ Images may differ from those that the fields were trained for in exposure, encod
 - "usual": the table looks as expected. The method above does everything.
 - "unclear": no full shadow is visible, so that the lamp and the exposure cannot be separated. The method above runs
   first. Its estimate is kept if its loss is low, or if the image model fitted at its poses is the usual one.
+  Otherwise, the next case applies.
 - "other": an image model is fitted first (`Calibrator`), with each object in the pose that fits its masks best at any
   brightness. This is done for linear and for sRGB values. The method above then runs on the adapted images and fields,
   first with the encoding that leaves less unexplained. The other encoding is tried if the loss is high or the estimate

@@ -180,8 +180,8 @@ class HttpRobot:
 
     def __init__(self, url: str, names: tuple[str, ...], timeout_s: float = ANSWER_S) -> None:
         self._url, self._names, self._timeout_s = url.rstrip("/"), names, timeout_s
-        # Timeouts of a synchronous client begin anew with every byte, so whoever sends few of them holds it for ever.
-        # Requests run in an event loop instead, where a time limits each as a whole.
+        # Timeouts of a synchronous client restart with every byte, so that a slow sender could hold it for ever.
+        # Requests run in an event loop instead, which limits the time of each request as a whole.
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="robot over HTTP", daemon=True)
         self._thread.start()
