@@ -53,8 +53,8 @@ class OsfError(ValueError):
         >>> try:
         ...     fields.load("mustard")
         ... except OsfError as error:
-        ...     print(str(error)[:45])
-        There is no field named 'mustard'; did you me
+        ...     print(error)
+        There is no field named 'mustard'; did you mean 006_mustard_bottle? known: ...
     """
 
     def __init__(self, sentence: str = "") -> None:

@@ -62,8 +62,8 @@ _SHOWN = Quality(samples_per_side=2)
 _LOST_AFTER = 2  # looks at which an object is doubted, one after another
 _SEARCHES = 2  # for lost objects, at most, in one episode: each takes as long as a goal image
 _RETREAT = 2  # actions away from the objects, before a search
-_RETREAT_M_S = 0.2  # along the faster axis: slower than a push, lest it touches what it passes
-_DISTURBANCES = frozenset({"lamp", "object", "found", "camera", "brightness"})  # after which steps are counted anew
+_RETREAT_M_S = 0.2  # along the faster axis: slower than a push, in case it touches an object
+_DISTURBANCES = frozenset({"lamp", "object", "found", "camera", "brightness"})  # steps restart after these
 _RENEWALS = 10  # at most: something that flickers must not keep a robot going for ever
 
 
@@ -537,7 +537,7 @@ class ProgressMonitor:
         self._least, self._since = np.inf, 0
 
     def is_stalled(self, distance_m: float) -> bool:
-        """Record the distance after an action; return whether it has not shrunk for 16 actions, then count anew."""
+        """Record the distance after an action; return whether it has not shrunk for 16 actions, then restart the count."""
         if distance_m < self._least - _PROGRESS_M:
             self._least, self._since = distance_m, 0
             return False

@@ -131,7 +131,7 @@ def is_on_table(episode: PushEpisode) -> Bool[np.ndarray, "T1"]:
 # The state of B scenes of N objects while they are rolled out, and what the pusher does in them.
 
 
-_MOVED_M, _MOVED_RAD = 1e-3, 0.02  # during an action: less is taken for rest
+_MOVED_M, _MOVED_RAD = 1e-3, 0.02  # during an action: an object that moves less counts as resting
 ASIDE = 0.035  # about a cell of the map of directions [rad]
 
 

@@ -499,7 +499,7 @@ def _disturbed(
 def _substeps(
     number: Tensor, start: tuple[Tensor, ...], velocity: Tensor, shift: Tensor, centre: Tensor, quaternion: Tensor
 ) -> Substeps:
-    motion = Motion(*start, floor=torch.zeros(number.shape))  # the floor plays no part: nothing is moved here
+    motion = Motion(*start, floor=torch.zeros(number.shape))  # the floor is not used: nothing is moved here
     return Substeps(number, sleeping(motion), velocity, shift, centre, quaternion)
 
 
@@ -925,7 +925,7 @@ class _Run(PushTraining):
 
     def measure(self) -> None:
         super().measure()
-        if self.fruitless >= self._config.patience:  # what is left of this part would be in vain
+        if self.fruitless >= self._config.patience:  # the rest of this part would gain nothing
             self.done = self._config.iterations if self.done < self._config.iterations else self.total
             self.fruitless = 0
 

@@ -57,7 +57,7 @@ Losses = Float[np.ndarray, "K"]
 #
 # phi and phi_drawn the signed distances to the borders of the mask and of the drawn outline. A mask whose border is
 # off by a constant is marginalised where the table fixes how large an object appears. xi is a shift in the world
-# and a turn about the object's origin. Which surfels are visible is found anew at each step and frozen within it.
+# and a turn about the object's origin. Visibility of surfels is determined at each step and fixed within it.
 
 
 _ITERATIONS = 40

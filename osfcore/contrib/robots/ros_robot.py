@@ -119,7 +119,7 @@ def _plain(frame: str) -> str:
 # The part of rosbridge's protocol (v2.0, JSON over a websocket) that a robot needs: subscribe, advertise, publish.
 #
 # roslibpy speaks all of it, but through the reactor of Twisted, of which a process has one that cannot be started
-# twice: a lost connection could not be opened anew, nor closed without leaving its threads.
+# twice: a lost connection could not be reopened, nor closed without leaving its threads.
 
 _MOST_BYTES = MOST_PICTURE_BYTES * 4 // 3 + MOST_JSON_BYTES  # of a message: pictures come in base64
 
