@@ -537,7 +537,7 @@ class ProgressMonitor:
         self._least, self._since = np.inf, 0
 
     def is_stalled(self, distance_m: float) -> bool:
-        """Record the distance after an action; return whether it has not shrunk for 16 actions, then restart the count."""
+        """Record the distance after an action; return whether it has not shrunk for 16 actions, then restart."""
         if distance_m < self._least - _PROGRESS_M:
             self._least, self._since = distance_m, 0
             return False
