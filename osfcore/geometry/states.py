@@ -100,9 +100,7 @@ class Observation:
         time_s: time since the last reset [s].
 
     Example:
-        >>> observation = Observation(
-        ...     cameras, rendered.rgb[0], state.names, rendered.masks[0], pusher, time_s=0.0
-        ... )
+        >>> observation = Observation(cameras, images, state.names, masks, pusher, time_s=0.0)
         >>> observation.images.shape, observation.masks.shape
         ((4, 128, 128, 3), (4, 1, 128, 128))
     """
