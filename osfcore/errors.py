@@ -1,7 +1,7 @@
-"""Errors of inputs: one sentence each, with the value and what is allowed.
+"""Errors: each message is one sentence that names the wrong value and what is allowed.
 
-Every error is an `OsfError`, whose text the command line and REST show as it is. Constructors take the facts, keep them
-as fields and write the sentence.
+Every error is an `OsfError`. The command line and REST show its text unchanged. Constructors take the facts, keep them
+as attributes, and write the sentence.
 """
 
 import difflib
@@ -19,7 +19,7 @@ _MOST_NEAR = 3  # names that may have been meant
 
 
 def shown(value: object, most: int = _SHOWN_CHARACTERS) -> str:
-    """Return a value as a message shows it: on one line, printable, cut in the middle if it is long."""
+    """Return a value as text for a message: one line of printable characters, cut in the middle if it is long."""
     text = str(value)
     if len(text) > most:
         text = f"{text[: most * 2 // 3]}...{text[-most // 3 :]}"
@@ -37,7 +37,7 @@ def _rebuilt(kind: type["OsfError"], sentence: str, facts: dict[str, object]) ->
 
 
 def _meant(name: str, known: list[str]) -> str:
-    """Return a question for known names that contain the given one or are spelt alike; "" if there are none."""
+    """Return a question about known names that contain the given one or are spelt like it; "" if there are none."""
     if not isinstance(name, str) or not 0 < len(name) <= _SHOWN_CHARACTERS:
         return ""
     near = [one for one in known if name.lower() in one.lower()] or difflib.get_close_matches(name, known, cutoff=0.7)
@@ -45,13 +45,23 @@ def _meant(name: str, known: list[str]) -> str:
 
 
 class OsfError(ValueError):
-    """A mistake in an input, in one sentence that a user can act on."""
+    """Base of all errors of this library: a wrong input, described in one sentence that a user can act on.
+
+    It is a `ValueError`. `str(error)` is the sentence.
+
+    Example:
+        >>> try:
+        ...     fields.load("mustard")
+        ... except OsfError as error:
+        ...     print(error)
+        There is no field named 'mustard'; did you mean 006_mustard_bottle? known: ...
+    """
 
     def __init__(self, sentence: str = "") -> None:
         super().__init__(shown(sentence, _MOST_CHARACTERS))
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle the sentence and the facts, for the way out of a worker process."""
+        """Pickle the sentence and the facts, so that a worker process can send the error."""
         return _rebuilt, (type(self), str(self), self.__dict__)
 
 
@@ -60,8 +70,8 @@ class InvalidInput(OsfError):
 
     Args:
         what: name of the value, with its unit if it has one.
-        value: what was given.
-        allowed: what is allowed, in words.
+        value: the value that was given.
+        allowed: description of what is allowed.
     """
 
     def __init__(self, what: str, value: object, allowed: str) -> None:
@@ -70,11 +80,11 @@ class InvalidInput(OsfError):
 
 
 class UnknownName(OsfError):
-    """A name that is not among the known ones.
+    """A name that does not exist.
 
     Args:
-        kind: what the name names, such as "object" or "camera".
-        name: what was given.
+        kind: kind of thing that has the name, such as "object" or "camera".
+        name: the name that was given.
         known: the names that exist.
     """
 
@@ -86,10 +96,10 @@ class UnknownName(OsfError):
 
 
 class NotThere(UnknownName):
-    """An identifier of nothing, which is not shown to people; most often it was deleted meanwhile.
+    """An identifier that does not exist, most often because its thing was deleted. People do not see identifiers.
 
     Args:
-        kind: what it would be, such as "scene".
+        kind: kind of thing, such as "scene".
     """
 
     def __init__(self, kind: str) -> None:
@@ -98,7 +108,11 @@ class NotThere(UnknownName):
 
 
 class MissingAssets(OsfError):
-    """Objects that the catalogue knows but whose meshes have not been fetched."""
+    """Objects of the catalogue whose meshes have not been fetched.
+
+    Args:
+        names: names of the objects.
+    """
 
     def __init__(self, names: Iterable[str]) -> None:
         self.names = sorted(names)
@@ -109,7 +123,13 @@ class MissingAssets(OsfError):
 
 
 class OverlappingObjects(OsfError):
-    """Two bodies that penetrate each other."""
+    """Two bodies that penetrate each other.
+
+    Args:
+        first: name of one body.
+        second: name of the other.
+        depth_m: depth of penetration [m].
+    """
 
     def __init__(self, first: str, second: str, depth_m: float) -> None:
         self.first, self.second = first, second
@@ -117,7 +137,12 @@ class OverlappingObjects(OsfError):
 
 
 class NoRoom(OsfError):
-    """Objects that could not be placed side by side in the workspace."""
+    """Objects for which no layout without overlaps was found in the workspace.
+
+    Args:
+        names: names of the objects.
+        tries: number of layouts that were tried.
+    """
 
     def __init__(self, names: Iterable[str], tries: int) -> None:
         super().__init__(
@@ -127,7 +152,12 @@ class NoRoom(OsfError):
 
 
 class CorruptFile(OsfError):
-    """A file or archive that cannot be read as what it should be."""
+    """A file or archive whose contents cannot be used.
+
+    Args:
+        path: the file.
+        reason: why it cannot be used.
+    """
 
     def __init__(self, path: Path | str, reason: str) -> None:
         super().__init__(f"{path} cannot be used: {reason}.")
@@ -135,7 +165,12 @@ class CorruptFile(OsfError):
 
 
 class CannotWrite(OsfError):
-    """A place where results cannot be written; what was there before is untouched."""
+    """A file or folder that cannot be written. What was there before is unchanged.
+
+    Args:
+        path: the file or folder.
+        reason: why it cannot be written.
+    """
 
     def __init__(self, path: Path | str, reason: str) -> None:
         super().__init__(f"{path} cannot be written: {reason}.")
@@ -143,14 +178,23 @@ class CannotWrite(OsfError):
 
 
 class WorkerDied(OsfError):
-    """A worker process that ended in the middle of its work."""
+    """A worker process that died in the middle of its work.
+
+    Args:
+        what: what it was doing.
+    """
 
     def __init__(self, what: str) -> None:
         super().__init__(f"A worker process died while {what}; start it again, with fewer workers if memory ran out.")
 
 
 class FetchFailed(OsfError):
-    """Something that could not be downloaded, verified or written; nothing was changed."""
+    """A download that failed, or could not be verified or written. Nothing was changed.
+
+    Args:
+        what: what should have been fetched.
+        reason: why it failed.
+    """
 
     def __init__(self, what: str, reason: str) -> None:
         super().__init__(f"{what} could not be fetched: {reason}. Nothing was changed.")
@@ -161,8 +205,8 @@ def finite_vector(value: object, size: int, what: str) -> Float[np.ndarray, "siz
     """Return a float64 copy of a vector after checking it.
 
     Args:
-        value: anything that NumPy makes an array of.
-        size: how many numbers it must have.
+        value: anything that NumPy can turn into an array.
+        size: number of components.
         what: name of the value for the error, with its unit.
 
     Raises:
@@ -178,13 +222,13 @@ def finite_vector(value: object, size: int, what: str) -> Float[np.ndarray, "siz
 
 
 def check_ranges(*limits: tuple[str, float, float, float]) -> None:
-    """Refuse numbers outside their ranges, NaN included.
+    """Check that numbers are in their ranges. NaN is not.
 
     Args:
         limits: name, value, least and largest allowed value of each number.
 
     Raises:
-        InvalidInput: for the first that is out of range.
+        InvalidInput: for the first number that is out of range.
     """
     for what, value, low, high in limits:
         if not low <= value <= high:
@@ -202,25 +246,25 @@ def check_seed(value: int) -> int:
 
 
 def check_unique(what: str, names: Sequence[str], allowed: str = "without repetition") -> None:
-    """Refuse names of which two are equal.
+    """Check that no name occurs twice.
 
     Raises:
-        InvalidInput: if so.
+        InvalidInput: if a name does.
     """
     if len(set(names)) != len(names):
         raise InvalidInput(what, ", ".join(names), allowed)
 
 
 def check_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:
-    """Refuse names that do not exist.
+    """Check that names exist.
 
     Args:
-        kind: what they name, such as "object" or "camera".
-        names: what was given.
+        kind: kind of thing that has the names, such as "object" or "camera".
+        names: the names that were given.
         known: the names that exist.
 
     Raises:
-        UnknownName: for the first that is not known.
+        UnknownName: for the first name that is not known.
     """
     for name in names:
         if name not in known:

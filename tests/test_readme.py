@@ -1,5 +1,6 @@
 """The commands and programs of README and docs work as they stand."""
 
+import doctest
 import json
 import os
 import re
@@ -183,6 +184,22 @@ def test_examples_of_the_python_reference_run(page, data_dir, tmp_path):
         done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-500:]
     assert done.stdout
+
+
+@pytest.fixture(scope="module")
+def example_names(library):
+    """The public names, and what the program at the top of the reference defines; the meshes are those of tests."""
+    names = {name: getattr(osfcore, name) for name in osfcore.__all__}
+    exec(*code((ROOT / "docs" / "reference" / "python" / "index.md").read_text(), "python"), names)
+    return names | {"assets": library}
+
+
+@pytest.mark.parametrize("name", osfcore.__all__)
+def test_each_public_name_has_an_example_that_runs(name, example_names, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (example,) = doctest.DocTestFinder(recurse=False).find(example_names[name], name, globs=example_names)
+    assert example.examples
+    assert doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example).failed == 0
 
 
 def test_the_python_reference_has_every_public_name():

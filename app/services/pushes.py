@@ -173,7 +173,7 @@ class Predictions:
         if not state.names:
             raise InvalidInput("number of objects", 0, "at least 1")
         if state.pusher is None:
-            raise InvalidInput("pusher of the state", "missing", "given: predictions start from where it is")
+            raise InvalidInput("pusher of the state", "missing", "given, because predictions start from it")
         if before is not None and set(before.names) != set(state.names):
             raise InvalidInput("objects one action ago", ", ".join(before.names), "those of the state")
         known = self._fields()

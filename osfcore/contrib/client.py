@@ -1,11 +1,11 @@
-"""The service as an object: tables, goals, estimates, predictions, episodes.
+"""A Python client of the REST service: tables, goals, estimates, predictions, episodes.
 
     with Client("http://127.0.0.1:8000") as osf:
         goal = osf.upload_goal("photo.jpg")
         for episode in osf.episode(goal):
             print(episode.done, episode.note)
 
-Poses, cameras and light come as the core's own types, images as linear RGB in [0, 1].
+It returns poses, cameras and lights as types of the core, and images as linear RGB in [0, 1].
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ from osfcore.io.scene_file import (
 
 
 class Health(Entry):
-    """Whether and how the service runs.
+    """State of the service.
 
     Attributes:
         status: "ok" or "degraded".
-        problems: what is wrong now, a sentence each.
-        version: of the program.
-        stage: of the simulation: "starting", "ready" or "restarting".
+        problems: present problems, one sentence each.
+        version: version of the program.
+        stage: state of the simulation: "starting", "ready" or "restarting".
     """
 
     status: str
@@ -64,13 +64,13 @@ class Health(Entry):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RemoteScene:
-    """A table of the service.
+    """A simulated table in the service.
 
     Attributes:
-        id: its identifier.
-        state: true poses of the objects, light and pusher.
-        cameras: that look at it; the last one takes goal images.
-        time_s: simulated time since it was made [s].
+        id: identifier of the table.
+        state: true poses of the objects, the light and the pusher.
+        cameras: cameras that look at the table. The last one takes goal images.
+        time_s: simulated time since the table was made [s].
     """
 
     id: str
@@ -92,13 +92,13 @@ class _SceneFacts(Entry):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Goal:
-    """A goal image that the service keeps.
+    """A goal image in the service.
 
     Attributes:
-        id: its identifier.
-        name: for people.
-        camera: that took the image.
-        names: of the objects whose places in it are known; none of a photo.
+        id: identifier of the goal.
+        name: name for people.
+        camera: camera that took the image.
+        names: names of the objects whose goal poses are known; empty for a photo.
     """
 
     id: str
@@ -122,14 +122,14 @@ class _GoalFacts(Entry):
 
 
 class EpisodeStep(Entry):
-    """One round of the loop, or how it was before the first.
+    """One round of an episode. The first entry describes the start.
 
     Attributes:
         step: actions executed so far.
-        image_cost: mean squared difference of goal image and rendered estimate.
-        to_goal_mm: of each object as estimated [mm]; None where the method looks at images alone.
-        to_goal_deg: likewise [deg].
-        seconds: spent, by part of the loop [s].
+        image_cost: mean squared difference between the goal image and the rendered estimate.
+        to_goal_mm: estimated distance of each object from its goal [mm]; None if the method compares images only.
+        to_goal_deg: estimated angle of each object from its goal [deg]; None if the method compares images only.
+        seconds: time spent on each stage [s].
     """
 
     step: int
@@ -140,17 +140,17 @@ class EpisodeStep(Entry):
 
 
 class Running(Entry):
-    """Work of the service as it is now.
+    """Present state of a job of the service.
 
     Attributes:
-        id: its identifier.
-        status: of its job.
-        stage: of the work, such as "first", "goal", "plan", "act" in an episode.
-        done: units of work, or actions of an episode, that are done.
-        total: at most so many units; 0 before it is known.
-        note: the work of the moment, for people.
-        eta_s: estimated time left [s].
-        error: why it failed, if it did.
+        id: identifier of the job.
+        status: status of the job.
+        stage: present stage, such as "first", "goal", "plan" or "act" in an episode.
+        done: units of work that are done; in an episode, actions.
+        total: largest number of units; 0 while it is unknown.
+        note: what the job is doing, for people.
+        eta_s: estimated time left [s]; None while it is unknown.
+        error: why the job failed; None if it did not.
     """
 
     id: str
@@ -164,20 +164,20 @@ class Running(Entry):
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing more comes."""
+        """Whether the job has ended."""
         return self.status not in ("queued", "running", "paused")
 
 
 class Episode(Running):
-    """An episode as it is now.
+    """Present state of an episode. It has the attributes of `Running` as well.
 
     Attributes:
-        name: for people.
-        scene: its table.
-        outcome: "reached", "out of steps" or "refused" once it has ended by itself.
-        text: the outcome in a sentence.
-        steps: all so far.
-        files: names for `Client.download`.
+        name: name for people.
+        scene: identifier of the table.
+        outcome: "reached", "out of steps" or "refused"; None while it runs, or if it was cancelled or failed.
+        text: the outcome in one sentence.
+        steps: all rounds so far.
+        files: names of the files that `Client.download` can fetch.
     """
 
     name: str
@@ -189,17 +189,17 @@ class Episode(Running):
 
 
 class Estimate(Running):
-    """An estimate of poses and light as it is now.
+    """Present state of an estimate of poses and light. It has the attributes of `Running` as well.
 
     Attributes:
-        estimate: the result as in state.json; None before it is there.
+        estimate: the result in the form of state.json; None while it runs.
     """
 
     estimate: EstimateJson | None
 
     @property
     def estimated(self) -> EstimatedState | None:
-        """The result; None before it is there."""
+        """The result; None while it runs."""
         return None if self.estimate is None else self.estimate.estimate()
 
 
@@ -211,11 +211,11 @@ _RECONNECTS = 5  # in a row, without an event between them
 
 
 class ServiceError(OsfError):
-    """The service refused a request, or does not answer.
+    """The service refused a request, or did not answer.
 
     Args:
-        sentence: for a person.
-        status: of HTTP; 0 without an answer.
+        sentence: the message, one sentence.
+        status: HTTP status; 0 if there was no answer.
     """
 
     def __init__(self, sentence: str, status: int = 0) -> None:
@@ -227,7 +227,7 @@ class Connection:
     """A connection to one service.
 
     Args:
-        http: an HTTP client with base address and headers; closed with this.
+        http: an HTTP client with base address and headers. Closing the connection closes it.
     """
 
     def __init__(self, http: httpx2.Client) -> None:
@@ -249,11 +249,11 @@ class Connection:
         """Return the parsed answer to a request with a file.
 
         Args:
-            method: of HTTP.
-            path: from the root.
-            content: of the file.
-            kind: its media type.
-            query: parameters; those that are None are left out.
+            method: HTTP method.
+            path: path from the root of the service.
+            content: contents of the file.
+            kind: media type of the file.
+            query: query parameters. Those that are None are left out.
 
         Raises:
             ServiceError: if it is refused or there is no answer.
@@ -269,7 +269,7 @@ class Connection:
         return self._answer("GET", path, query).content
 
     def download(self, path: str, to: Path) -> Path:
-        """Write a file to disk piece by piece; it appears when it is whole.
+        """Write a file to disk in chunks. It appears once it is complete.
 
         Raises:
             ServiceError: if there is none or no answer.
@@ -283,7 +283,7 @@ class Connection:
         return to
 
     def follow(self, path: str) -> Iterator[Any]:
-        """Yield the parsed data of a stream of events until it ends; open it again where the network breaks it.
+        """Yield the parsed data of a stream of events until it ends; reopen it if the network breaks it.
 
         Raises:
             ServiceError: if there is no such stream, or the service no longer answers.
@@ -340,13 +340,16 @@ _KINDS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp", ".hei
 
 
 class Client:
-    """A connection to a service that `osf serve` runs.
+    """A client of a running service (`osf serve`).
+
+    Methods with a `scene` argument take the identifier of a table; None means the table that the page shows. All
+    methods raise `ServiceError` if the service refuses the request or does not answer.
 
     Args:
-        url: of the service.
-        token: where it was started with one.
-        timeout_s: how long one answer may take [s]; following episodes and estimates has no limit.
-        connection: instead of url, token and timeout.
+        url: address of the service.
+        token: token of the service, if it was started with one.
+        timeout_s: longest time for one answer [s]. It does not limit how long episodes and estimates are followed.
+        connection: a connection to use instead of url, token and timeout.
     """
 
     def __init__(
@@ -361,23 +364,23 @@ class Client:
         self._service = connection or Connection(httpx2.Client(base_url=url, headers=headers, timeout=timeout_s))
 
     def __enter__(self) -> Self:
-        """Itself."""
+        """Return the client."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close."""
+        """Close the connection."""
         self.close()
 
     def close(self) -> None:
-        """End the connection; what runs in the service goes on."""
+        """Close the connection. Jobs of the service continue."""
         self._service.close()
 
     def health(self) -> Health:
-        """Return whether and how the service runs."""
+        """Return the state of the service."""
         return decode(Health, self._service.json("GET", "/api/health"), "health")
 
     def objects(self) -> tuple[str, ...]:
-        """Return the names of the objects that scenes can be made of."""
+        """Return the names of the objects that can be put on a table."""
         listed = self._service.json("GET", "/api/objects")["objects"]
         return tuple(one["name"] for one in listed if one["available"])
 
@@ -392,17 +395,17 @@ class Client:
         light: Light | None = None,
         poses: Mapping[str, Pose] | None = None,
     ) -> RemoteScene:
-        """Make a table and show it.
+        """Make a table and show it on the page.
 
         Args:
-            objects: their names; `count` that the seed draws otherwise.
-            count: how many, where they are not named.
-            seed: the same seed makes the same scene; any otherwise.
-            light: drawn from the seed otherwise.
-            poses: of all objects; drawn from the seed otherwise.
+            objects: names of the objects; None to draw `count` of them.
+            count: number of objects to draw if `objects` is None.
+            seed: seed of everything random. The same seed gives the same table; None takes a new one.
+            light: the light; None to draw it.
+            poses: `T_world_object` of all objects, by name; None to draw them.
 
         Raises:
-            ServiceError: if there can be no such scene.
+            ServiceError: if such a table is impossible.
         """
         body = {
             "objects": None if objects is None else list(objects),
@@ -414,14 +417,14 @@ class Client:
         return RemoteScene.of(self._service.json("POST", "/api/scenes", body))
 
     def scene(self, scene: str | None = None) -> RemoteScene:
-        """Return a table as it is now; the one that is shown if none is named."""
+        """Return the present state of a table."""
         return RemoteScene.of(self._service.json("GET", f"/api/scenes/{scene or self._shown()}"))
 
     def act(self, actions: Float[np.ndarray, "T 3"], scene: str | None = None) -> RemoteScene:
-        """Move the pusher by hand, each velocity (vx, vy, 0) [m/s] for 0.2 s.
+        """Move the pusher with velocities (vx, vy, 0) in the world [m/s], each for 0.2 s.
 
         Raises:
-            InvalidInput: if one of them is outside its limits.
+            InvalidInput: if an action is outside its limits.
         """
         body = {"actions": check_actions(np.asarray(actions)[None])[0].tolist()}
         return RemoteScene.of(self._service.json("POST", f"/api/scenes/{scene or self._shown()}/actions", body))
@@ -429,13 +432,13 @@ class Client:
     def image(
         self, camera: str = "goal", scene: str | None = None, *, size: int | None = None, pusher: bool = True
     ) -> Float32[np.ndarray, "h w 3"]:
-        """Return the image of a camera of a table.
+        """Return an image of a table, linear RGB in [0, 1].
 
         Args:
-            camera: "0" to "3", or "goal".
-            scene: the table; the one that is shown if none is named.
-            size: side of the image [px]; the scene's own otherwise.
-            pusher: whether it is shown.
+            camera: name of the camera: "0" to "3", or "goal".
+            scene: the table.
+            size: side of the image [px]; None for the size of the camera.
+            pusher: whether the image shows the pusher.
         """
         path = f"/api/scenes/{scene or self._shown()}/images/{camera}.png"
         return _image(self._service.bytes(path, size=size, pusher=str(pusher).lower()))
@@ -443,14 +446,14 @@ class Client:
     # Goals
 
     def upload_goal(self, photo: str | Path | Float[np.ndarray, "h w 3"], name: str | None = None) -> Goal:
-        """Send a photo of the goal.
+        """Upload a photo of the goal.
 
         Args:
-            photo: a file, or linear RGB in [0, 1].
-            name: for people; the file's own otherwise.
+            photo: an image file, or an image as linear RGB in [0, 1].
+            name: name for people; the name of the file if None.
 
         Raises:
-            InvalidInput: if there is no such file, or none of a kind that is taken.
+            InvalidInput: if the file does not exist, or is not an image of a supported type.
         """
         if isinstance(photo, np.ndarray):
             content, kind, name = encode_png(to_uint8(photo)), "image/png", name or "Photo"
@@ -458,28 +461,28 @@ class Client:
             path = Path(photo)
             suffix = path.suffix.lower()
             if suffix not in _KINDS or not path.is_file():
-                raise InvalidInput("photo", path, f"a file that is there and ends in {', '.join(_KINDS)}")
+                raise InvalidInput("photo", path, f"an existing file whose name ends in {', '.join(_KINDS)}")
             content, kind, name = path.read_bytes(), f"image/{_KINDS[suffix]}", name or path.stem
         return Goal.of(self._service.send("POST", "/api/goals", content, kind, name=name))
 
     def goal_of(
         self, poses: Mapping[str, Pose], *, light: Light | None = None, name: str = "Goal", scene: str | None = None
     ) -> Goal:
-        """Make a goal image in the simulation, in which some objects of a table lie elsewhere."""
+        """Make a goal image in the simulation, in which some objects of a table have these poses `T_world_object`."""
         body = {"scene": scene, "objects": _poses(poses), "light": _light(light), "name": name}
         return Goal.of(self._service.json("POST", "/api/goals", body))
 
     def random_goal(self, seed: int = 0, *, moved: int | None = None, scene: str | None = None) -> Goal:
-        """Make a goal image in which `moved` objects of a table lie elsewhere, as the seed draws it."""
+        """Make a goal image in which `moved` objects of a table lie at random places; None for a random number."""
         body = {"scene": scene, "random": {"seed": seed, "moved": moved}}
         return Goal.of(self._service.json("POST", "/api/goals", body))
 
     def goal_image(self, goal: Goal) -> Float32[np.ndarray, "h w 3"]:
-        """Return the image of a goal."""
+        """Return the image of a goal, linear RGB in [0, 1]."""
         return _image(self._service.bytes(f"/api/goals/{goal.id}/image.png"))
 
     def goal_problem(self, goal: Goal, scene: str | None = None) -> str:
-        """Return why a goal is unfit for a table, in a sentence; "" if it is fit."""
+        """Return why a goal does not suit a table, in one sentence; "" if it does."""
         return self._service.json("GET", f"/api/goals/{goal.id}/check", scene=scene)["text"]
 
     # Estimates and predictions
@@ -493,14 +496,15 @@ class Client:
         prior: str | None = None,
         seed: int = 0,
     ) -> Iterator[Estimate]:
-        """Estimate poses and light; yield the progress, last with the result.
+        """Estimate poses and light; yield the progress. The last value has the result.
 
         Args:
-            mode: "first" from masks alone, "next" without masks from an earlier estimate, "goal" from one view.
-            observation: a folder with observation.json; otherwise the cameras of a table are used.
-            scene: the table; the one that is shown if none is named.
-            prior: the earlier estimate of mode "next" and "goal"; the latest of the table otherwise.
-            seed: of the search.
+            mode: "first" for images with masks and no guess, "next" for images after an earlier estimate, "goal" for
+                one goal image.
+            observation: a folder with observation.json; None to use the cameras of a table.
+            scene: the table.
+            prior: identifier of the earlier estimate for modes "next" and "goal"; the latest of the table if None.
+            seed: seed of the search.
         """
         place, asked = "/api/estimates", {"mode": mode, "prior": prior, "seed": seed}
         if observation is None:
@@ -510,11 +514,11 @@ class Client:
         return self._followed(place, data, Estimate)
 
     def predict(self, actions: Float[np.ndarray, "K T 3"], state: SceneState | None = None) -> Rollouts:
-        """Predict what sequences of pusher velocities would do.
+        """Predict the poses of all objects under K sequences of T actions.
 
         Args:
-            actions: each held for 0.2 s [m/s].
-            state: to begin with; the true one of the table that is shown otherwise.
+            actions: velocities (vx, vy, 0) of the pusher in the world [m/s], each held for 0.2 s.
+            state: state to begin with; the true state of the table that the page shows if None.
 
         Raises:
             InvalidInput: if an action is outside its limits.
@@ -527,15 +531,15 @@ class Client:
     def episode(
         self, goal: Goal | Mapping[str, Pose], *, scene: str | None = None, seed: int = 0, **settings: object
     ) -> Iterator[Episode]:
-        """Rearrange a table until it looks like the goal; yield the progress, last the outcome.
+        """Rearrange a table until it looks like the goal; yield the progress. The last value has the outcome.
 
-        The episode starts at once and goes on if nobody follows it any more; `cancel` ends it.
+        The episode starts at once. It continues if the caller stops iterating; `cancel` ends it.
 
         Args:
-            goal: a goal image, or poses of all objects.
-            scene: the table; the one that is shown if none is named.
-            seed: of the search and the planner.
-            settings: that differ from the defaults: steps, replan_every, cost, samples, horizon, temperature,
+            goal: a goal image, or goal poses `T_world_object` of all objects.
+            scene: the table.
+            seed: seed of the search and the planner.
+            settings: settings that differ from the defaults: steps, replan_every, cost, samples, horizon, temperature,
                 despite_doubts, method.
 
         Raises:
@@ -546,14 +550,14 @@ class Client:
         return self._followed("/api/episodes", data, Episode)
 
     def episodes(self) -> tuple[Episode, ...]:
-        """Return the latest episodes, newest first, without their steps."""
+        """Return the latest episodes, newest first. Their `steps` are empty."""
         return tuple(decode(Episode, one, "episode") for one in self._service.json("GET", "/api/episodes")["episodes"])
 
     def cancel(self, running: Episode | Estimate) -> None:
-        """End an episode or an estimate; the actions of an episode are kept.
+        """Cancel an episode or an estimate. The steps of an episode so far are kept.
 
         Raises:
-            ServiceError: if it has ended already.
+            ServiceError: if the job has already ended.
         """
         noun = "episodes" if isinstance(running, Episode) else "estimates"
         self._service.json("DELETE", f"/api/{noun}/{running.id}")
@@ -562,9 +566,12 @@ class Client:
         """Write one of an episode's files to disk.
 
         Args:
-            episode: one whose `files` name it.
-            file: such as "video.mp4" or "report.json".
-            to: a file, or a folder to put it into.
+            episode: the episode.
+            file: a name in its `files`, such as "video.mp4" or "report.json".
+            to: the file to write, or the folder to write it into.
+
+        Returns:
+            The file that was written.
         """
         place = Path(to) / file if Path(to).is_dir() else Path(to)
         return self._service.download(f"/api/episodes/{episode.id}/files/{file}", place)
@@ -572,11 +579,11 @@ class Client:
     def _shown(self) -> str:
         current = self._service.json("GET", "/api/scenes")["current"]
         if current is None:
-            raise InvalidInput("table", "none", "one that is shown; make one first, with new_scene")
+            raise InvalidInput("table", "none", "a table that the page shows; call new_scene first")
         return current
 
     def _followed(self, place: str, data: dict[str, Any], kind: type[T]) -> Iterator[T]:
-        """Yield the state of a job now and after every change."""
+        """Yield the present state of a job, and its state after every change."""
         path = f"{place}/{data['id']}"
 
         def states() -> Iterator[T]:

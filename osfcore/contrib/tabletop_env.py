@@ -6,8 +6,8 @@ Each episode is a random rearrangement task (`osfcore.world.tasks`): a scene at 
     import osfcore.contrib.tabletop_env
     env = gymnasium.make("OSFTabletop-v0")
 
-or in one call `gymnasium.make("osfcore.contrib.tabletop_env:OSFTabletop-v0")`, which processes of vectorised
-environments need. Gymnasium has no entry points for packages since 1.0.
+or in one call `gymnasium.make("osfcore.contrib.tabletop_env:OSFTabletop-v0")`, which vectorised environments need in
+their processes. Gymnasium has no entry points for packages since 1.0.
 
 Raises:
     MissingExtra: on import, if Gymnasium is not installed.
@@ -54,11 +54,11 @@ _FRAME_SIDE = 256
 
 
 class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
-    """A pusher moves some objects of a scene to their goals, and leaves the others alone.
+    """A pusher must move some objects of a scene to their goals, and leave the others in place.
 
     The action is the pusher's velocity (vx, vy) [m/s], each within 0.3, held for 0.2 s. The observation is a dict:
 
-        pusher   (2,) its place [m]
+        pusher   (2,) its position [m]
         objects  (N,) the number of each object among `objects_to_choose_from`    poses, both
         poses    (N, 7) position [m] and quaternion (w, x, y, z) with w >= 0, T_world_object    poses, both
         pixels   (V, h, w, 3) images of the four cameras, linear RGB, 8 bits    pixels, both
@@ -69,28 +69,29 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         r = -(1/N) sum_n sqrt(|p_n - p_n*|^2 + (2 sin(theta_n / 4))^2)
 
     with theta_n the angle to the nearest orientation that looks like the goal's: 2 sin(theta / 4) is the distance of
-    unit quaternions, the nearer of both signs (`ObjectScore.pose6d_symmetric`). An episode terminates when every object
-    that had to move is within 2 cm and 0.1 rad of its goal and no other is farther than that from where it should be;
-    Gymnasium truncates it after 30 actions, or `max_episode_steps` of `gymnasium.make`.
+    unit quaternions, for the nearer sign (`ObjectScore.pose6d_symmetric`). An episode terminates when all objects are
+    within 2 cm and 0.1 rad of their goals, including those that should not move. Gymnasium truncates it after 30
+    actions, or `max_episode_steps` of `gymnasium.make`.
 
     `info` holds the objects' `names`, which had to move (`moved`), `success`, `moved_mm` and `moved_deg`, the mean
     errors of these, and `others_mm`, the largest of the others.
 
     Args:
-        data_dir: whose `objects` are used; the program's own if None.
-        names: objects to choose from; all that are there if None.
-        objects: in each scene (N).
-        family: of the tasks: "shifted", "turned", "crowded", "relit" or "upright".
-        obs: what is observed: "poses", "pixels" or "both".
-        image_side: of observed images [px].
+        data_dir: data directory with `objects`; the default one if None.
+        names: names of the objects to choose from; all available ones if None.
+        objects: number of objects in each scene (N).
+        family: family of the tasks: "shifted", "turned", "crowded", "relit" or "upright".
+        obs: contents of observations: "poses", "pixels" or "both".
+        image_side: side of observed images [px].
         render_mode: "rgb_array" or None.
 
     Attributes:
         objects_to_choose_from: names of the objects by their numbers in observations.
 
     Raises:
-        InvalidInput: if a choice is not among those, or there are too few objects.
-        MissingAssets, UnknownName: if an object is not there.
+        InvalidInput: if a choice is not one of these, or there are too few objects.
+        MissingAssets: if the mesh of an object has not been fetched.
+        UnknownName: if there is no such object.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP_S)}  # noqa: RUF012  as Gymnasium has it
@@ -129,15 +130,15 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin a new task.
+        """Start a new task.
 
         Args:
-            seed: of this task and all that follow; None to go on.
+            seed: seed of this task and all later ones; None to continue with the present seed.
             options: {"task_seed": s, "task_number": n} for task n of the set that evaluations use with seed s and the
                 same objects; None for a random task.
 
         Raises:
-            NoRoom: if objects do not fit, also after some draws.
+            NoRoom: if no layout without overlaps was found.
             InvalidInput: if there are other options, or they are not whole numbers from 0 on.
         """
         super().reset(seed=seed)
@@ -152,7 +153,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         """Hold a velocity for 0.2 s.
 
         Raises:
-            InvalidInput: if it is outside the action space; the table is unchanged.
+            InvalidInput: if the velocity is outside the action space. The table is then unchanged.
         """
         vx, vy = finite_vector(action, 2, "action (vx, vy) [m/s]")
         self._begun()
@@ -161,7 +162,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         return self._observation(), -score.pose6d_symmetric, score.is_tight(), False, self._info(score)
 
     def render(self) -> UInt8[np.ndarray, "h w 3"] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw the table from the goal camera, in linear RGB of 8 bits."""
+        """Return an image of the table from the goal camera, linear RGB with 8 bits."""
         if self.render_mode is None:
             return None
         self._begun()

@@ -1,9 +1,12 @@
-"""Algorithm 1: estimate, plan, act, look again, as a generator of events over a world.
+"""Algorithm 1 of the paper as a generator of events: estimate, plan, act, and estimate again.
 
-Deviations from the paper: goal poses are found once, before anything moves, so that pushes can be aimed at them and a
-goal that cannot be explained is noticed at once; each later estimate begins at what the dynamics model predicted; an
-object that was lost is looked for, a lamp that was moved is estimated again, and where nothing gets better plans are
-drawn anew.
+Deviations from the paper:
+
+- Goal poses are estimated once, before anything moves. Pushes can then be aimed at them, and a goal image that does not
+  match is reported at once.
+- Each later estimate starts at the state that the dynamics model predicted.
+- An object that was lost is searched. A lamp that was moved is estimated again.
+- New plans are made if the objects stop approaching their goals.
 """
 
 from __future__ import annotations
@@ -59,25 +62,40 @@ _SHOWN = Quality(samples_per_side=2)
 _LOST_AFTER = 2  # looks at which an object is doubted, one after another
 _SEARCHES = 2  # for lost objects, at most, in one episode: each takes as long as a goal image
 _RETREAT = 2  # actions away from the objects, before a search
-_RETREAT_M_S = 0.2  # along the faster axis: slower than a push, lest it touches what it passes
-_DISTURBANCES = frozenset({"lamp", "object", "found", "camera", "brightness"})  # after which steps are counted anew
+_RETREAT_M_S = 0.2  # along the faster axis: slower than a push, in case it touches an object
+_DISTURBANCES = frozenset({"lamp", "object", "found", "camera", "brightness"})  # steps restart after these
 _RENEWALS = 10  # at most: something that flickers must not keep a robot going for ever
 
 
 class Episode:
-    """One table on its way to a goal.
+    """One episode: estimate, plan and push until the table looks like the goal (Algorithm 1 of the paper).
 
-    Whoever drives it takes events one by one: not asking for the next one is a pause, closing the generator is the end.
+    `run` yields events. The episode pauses while the caller does not take the next event, and ends when the caller
+    closes the generator.
 
     Args:
-        world: cameras and pusher.
-        models: of the objects.
-        goal: an image, or poses, perhaps with a photograph of them.
-        settings: may be replaced while the episode runs.
-        rng: draws everything.
-        start: what is known of the first frame already; without it, it is estimated from images with masks.
-        prepared: estimates that are used in place of new ones where they explain the images.
-        parts: that estimate, plan and compare futures.
+        world: the world to observe and act in.
+        models: models of the objects.
+        goal: a goal image, or goal poses.
+        settings: settings. The attribute `settings` may be replaced while the episode runs.
+        rng: random generator of everything random.
+        start: estimate of the first frame, if there is one already. If None, it is estimated from images with masks.
+        prepared: earlier estimates, which are used instead of new ones if they explain the images.
+        parts: replacements of the estimators, the planner and the cost.
+
+    Example:
+        >>> world = Tabletop(assets, request=SceneRequest(names=(name,)))
+        >>> world.arrange(seed=0)
+        >>> episode = Episode(
+        ...     world,
+        ...     load_scene_models((name,), fields, assets, None),
+        ...     PoseGoal.of(world.truth(), {name: there}),
+        ...     EpisodeSettings(steps=30),
+        ...     np.random.default_rng(0),
+        ... )
+        >>> type(next(episode.run())).__name__  # in full: for event in episode.run(): ...
+        'Observed'
+        >>> world.close()
     """
 
     settings: EpisodeSettings
@@ -110,11 +128,11 @@ class Episode:
         self._expected: SceneState | None = None  # what the last action should have led to
 
     def run(self) -> Iterator[Event]:
-        """Yield everything that happens, until a `Finished`.
+        """Run the episode; yield an event for each thing that happens. The last event is a `Finished`.
 
         Raises:
-            InvalidInput: if the world gives no masks for the first frame, or goal and scene hold other objects.
-            UnknownName: if an object is not known.
+            InvalidInput: if the world has no masks for the first frame, or goal and scene have different objects.
+            UnknownName: if there is no model of an object.
         """
         yield from self._begin()
         if not (yield from self._find_goal()):
@@ -138,7 +156,7 @@ class Episode:
             self._is_stalled = self._progress.is_stalled(float(distance.sum()))
             if self._is_stalled:
                 self._planner.reset()
-                yield self._noticed("stalled", "Nothing has come nearer for some time; drawing new plans.")
+                yield self._noticed("stalled", "No object has come closer to its goal for a while; making a new plan.")
 
     # Looking
 
@@ -153,7 +171,7 @@ class Episode:
             self._scene = self._of_goal = self._scene.to(found.image_model, observation.names)
             observation = self._scene.normalized(observation)
             if found.image_model is not None and found.image_model.oddities:
-                text = f"The pictures are unusual ({found.image_model.oddities}); allowed for."
+                text = f"The images are unusual ({found.image_model.oddities}); estimates allow for it."
                 yield self._noticed("pictures", text)
         else:
             self._estimate = self._start
@@ -178,7 +196,7 @@ class Episode:
     def _look(
         self, look: Look, observation: Observation, steps: Iterator[EstimateStep]
     ) -> Iterator[Event]:  # returns the last EstimateStep
-        """Take what was prepared, if it fits; else run an estimator."""
+        """Use the prepared estimate if it fits; else run an estimator."""
         with self._timer.stage(look):
             step = None if self._prepared is None else self._prepared.step(look, self._models.appearance, observation)
         if step is None:
@@ -222,7 +240,7 @@ class Episode:
             yield self._noticed("object", f"Somebody moved {', '.join(names)}: found again.", names)
 
     def _find_lost(self) -> Iterator[Event]:
-        """Look anew for what has been doubted for some time, once the pusher has made room."""
+        """Search objects that have been doubtful for some time, after the pusher has moved aside."""
         doubted = (name for name in self._estimate.doubted if name not in self._weak)
         self._doubted = {name: self._doubted.get(name, 0) + 1 for name in doubted}
         lost = tuple(name for name, looks in self._doubted.items() if looks >= _LOST_AFTER)
@@ -243,7 +261,7 @@ class Episode:
             yield self._noticed("found", f"Found {', '.join(lost)} again.", lost)
 
     def _retreat(self) -> Iterator[Event]:
-        """Draw the pusher back from the middle of the objects, so that it hides less."""
+        """Move the pusher away from the middle of the objects, so that it hides less."""
         state = self._estimate.state
         assert state.pusher is not None
         away = state.pusher[:2] - state.poses.position[:, :2].mean(axis=0)
@@ -276,7 +294,7 @@ class Episode:
             yield self._noticed("goal", f"The goal image is not explained well: {doubts}.")
             if not self.settings.despite_doubts:
                 yield self._stepped()
-                yield self._finished("refused", f"Nothing was moved, for the goal image is doubtful: {doubts}.")
+                yield self._finished("refused", f"Nothing was moved, because the goal image is doubtful: {doubts}.")
                 return False
         return True
 
@@ -316,10 +334,10 @@ class Episode:
         if far.max() <= self.settings.reached_m and np.all(turned[~rolled] <= self.settings.reached_rad):
             if rolled.any():
                 names = ", ".join(np.array(self._estimate.state.names)[rolled])
-                return "reached", f"Everything is in its place, but on another side than in the goal: {names}."
+                return "reached", f"All objects are at their goals, but these lie on another side: {names}."
             return "reached", f"The table looks like the goal{'' if self._number else ' already'}."
         if self._left() <= 0:
-            return "out of steps", f"All {self._number} pushes are done, and not everything is in its place."
+            return "out of steps", f"All {self._number} pushes are done, but some objects are not at their goals."
         return None
 
     def _stepped(self) -> Stepped:
@@ -334,12 +352,12 @@ class Episode:
         )
 
     def _rendered(self, state: SceneState, camera: Camera, light: Light) -> Float[np.ndarray, "h w 3"]:
-        """The scene without the pusher, as the goal image would show it."""
+        """Render the scene without the pusher, as the goal camera would see it."""
         batch = SceneBatch.of(replace(state, light=light, pusher=None))
         return self._of_goal.models.together.render(batch, (camera,), quality=_SHOWN).rgb[0, 0]
 
     def _left(self) -> int:
-        """Actions that may still be executed."""
+        """Return the number of actions that may still be executed."""
         return self._counted_from + self.settings.steps - self._number
 
     def _noticed(self, matter: Matter, text: str, names: tuple[str, ...] = ()) -> Noticed:
@@ -352,41 +370,41 @@ class Episode:
 
 
 def _future(futures: Rollouts, step: int, state: SceneState) -> SceneState:
-    """The predicted state after some actions; the pusher where it is then, for nothing has been pushed since."""
+    """Return the predicted state after some actions, with the pusher where it is then."""
     poses = Pose(futures.positions[0, step], futures.quaternions[0, step])
     return replace(state, poses=poses, pusher=futures.pusher[0, step])
 
 
-# Models and pictures that agree: exposure, response, ambient light and table as the first frame showed them are kept.
+# Models and images that agree. Exposure, response, ambient light and table are kept as the first frame showed them.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AdaptedModels:
-    """Models of the objects in a scene, and how pictures are made to look as these do.
+    """Models of the objects that are adapted to the images of a scene.
 
     Attributes:
         models: fields and table, with the scene's ambient light and albedo.
-        image_model: of the pictures; None for those that fields were made for.
+        image_model: image model of the images; None for images like those that the fields were trained for.
     """
 
     models: ObjectModels
     image_model: ImageModel | None = None
 
     def to(self, image_model: ImageModel | None, names: tuple[str, ...]) -> AdaptedModels:
-        """Adapt these models, which must not be adapted yet, to pictures of another kind.
+        """Adapt these models to images with another image model. They must not be adapted yet.
 
         Args:
-            image_model: of the pictures; None leaves everything as it is.
-            names: of the objects that are needed.
+            image_model: image model of the images; None to change nothing.
+            names: names of the objects that are needed.
         """
         return self if image_model is None else AdaptedModels(adapted(self.models, names, image_model), image_model)
 
     def normalized(self, observation: Observation) -> Observation:
-        """Return pictures as these models show them."""
+        """Return an observation in the units of these models."""
         return observation if self.image_model is None else self.image_model.normalized(observation)
 
     def normalized_goal(self, goal: GoalImage) -> GoalImage:
-        """Return a goal image likewise."""
+        """Return a goal image in the units of these models."""
         return goal if self.image_model is None else replace(goal, image=self.normalized(goal.observed(())).images[0])
 
 
@@ -398,14 +416,14 @@ def estimate_goal_image(
     config: GoalImageConfig | None = None,
     shares: Mapping[str, float] | None = None,
 ) -> Iterator[EstimateStep]:
-    """Estimate the goal image as the scene's cameras would take it and, if doubtful, as fields were made for.
+    """Estimate the goal image with the image model of the scene and, if that is doubtful, with the usual one.
 
     Args:
         usual: models that are not adapted.
-        scene: models for the pictures of the first frame.
+        scene: models adapted to the first frame.
         goal: one view.
-        prior: how the objects lie now.
-        config: how much work to do.
+        prior: present state of the scene.
+        config: settings.
         shares: by object, its residual in the first frame as a share of its level, see `goal_allowance`.
     """
     best = yield from all_but_last(_estimated(scene, goal, prior, config, shares))
@@ -432,7 +450,7 @@ def _is_trusted(step: EstimateStep) -> bool:
     return step.estimate is not None and step.estimate.trusted
 
 
-# Relocalization of lost objects without masks: template matching in one camera's image, then tracking in all.
+# Relocalization of lost objects without masks: template matching in one camera's image, then tracking in all images.
 
 
 _TIED = 0.02  # share of the workspace by which cameras that see it equally well may differ
@@ -446,16 +464,17 @@ def relocalize(
     rng: np.random.Generator,
     config: GoalImageConfig | None = None,
 ) -> Iterator[EstimateStep]:
-    """Look for the doubted objects anywhere on the table; the last step holds the better of both estimates.
+    """Search the whole table for doubtful objects. The last step has the better of the old and the new estimate.
 
-    The camera is one of those that see most of the workspace, drawn at random so that another search uses another one.
+    One image is searched, from a camera that sees most of the workspace. It is drawn at random among equally good ones,
+    so that another search may use another camera.
 
     Args:
-        models: fields of the objects and the table.
-        observation: all views, at best without anything in front.
-        last: the estimate whose doubted objects are looked for.
-        rng: of the search.
-        config: how the one image is searched.
+        models: models of the objects and the table.
+        observation: all views, if possible without occlusions.
+        last: the estimate whose doubtful objects are searched.
+        rng: random generator of the search.
+        config: settings of the search in the one image.
     """
     state = last.state
     lost = [n for n, doubt in enumerate(last.doubts) if doubt]
@@ -488,7 +507,7 @@ def _share_of_workspace(camera: Camera) -> float:
         return float(np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=-1).mean())
 
 
-# Monitoring of a closed loop: distance to the goal, stalled progress, changes that no push explains.
+# Monitoring of an episode: distance to the goal, stalled progress, and changes that no push explains.
 
 
 _MAX_STALLED = 16  # actions without progress
@@ -499,14 +518,14 @@ _REACH_M = 0.2  # from the pusher to the middle of what it may have pushed, perh
 
 
 def offsets(goal: PoseGoal, state: SceneState) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """Measure how far each object is from where it should be: on the table's plane [m], and turned [rad]."""
+    """Return the distance of each object from its goal on the table's plane [m], and its angle from the goal [rad]."""
     target = np.array([goal.pose(name).quaternion for name in state.names]).reshape(-1, 4)
     turned = rotation_angle(state.poses.quaternion, target)
     return np.linalg.norm(goal.offsets_m(state), axis=1), np.asarray(turned)
 
 
 def lies_otherwise(goal: PoseGoal, state: SceneState) -> Bool[np.ndarray, "N"]:
-    """Find objects that lie on another side than in the goal: turning them about the vertical would not do."""
+    """Return which objects lie on another side than in the goal, so that no turn about the vertical is enough."""
     turns = (planar_turn(state.pose(name).quaternion, goal.pose(name).quaternion) for name in state.names)
     return np.array([turn is None for turn in turns], bool)
 
@@ -518,7 +537,7 @@ class ProgressMonitor:
         self._least, self._since = np.inf, 0
 
     def is_stalled(self, distance_m: float) -> bool:
-        """Take the distance after each action; true once it has not shrunk for 16 actions, and counting restarts."""
+        """Record the distance after an action; return whether it has not shrunk for 16 actions, then restart."""
         if distance_m < self._least - _PROGRESS_M:
             self._least, self._since = distance_m, 0
             return False
@@ -530,7 +549,7 @@ class ProgressMonitor:
 
 
 def moved_by_hand(expected: SceneState, now: SceneState) -> tuple[str, ...]:
-    """Find objects that are not where they were expected, too far from the pusher for a push to be the cause."""
+    """Return objects that are not where they were expected and too far from the pusher to have been pushed."""
     assert now.pusher is not None
     shift = np.linalg.norm(now.poses.position - expected.poses.position, axis=1)
     ends = [now.pusher] if expected.pusher is None else [now.pusher, expected.pusher]
@@ -539,21 +558,21 @@ def moved_by_hand(expected: SceneState, now: SceneState) -> tuple[str, ...]:
     return tuple(name for name, flag in zip(now.names, is_moved, strict=True) if flag)
 
 
-# Wall time of the stages of a closed loop, without what whoever drives its generator takes between two steps.
+# Wall time of the stages of an episode, without the time that its caller takes between two events.
 
 
 StepT = TypeVar("StepT")
 
 
 class StageTimer:
-    """Adds up seconds by stage."""
+    """Sums the time of each stage [s]."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count the time within the context."""
+        """Add the time within the context to a stage."""
         began = time.perf_counter()
         try:
             yield
@@ -561,7 +580,7 @@ class StageTimer:
             self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - began
 
     def steps(self, name: str, steps: Iterator[StepT]) -> Iterator[StepT]:
-        """Pass on steps, and count the time until each of them is there."""
+        """Yield steps, and add the time that each of them takes to a stage."""
         while True:
             with self.stage(name):
                 step = next(steps, None)
@@ -570,6 +589,6 @@ class StageTimer:
             yield step
 
     def taken(self) -> dict[str, float]:
-        """Seconds of each stage since this was asked last."""
+        """Return the time of each stage [s] since the last call."""
         taken, self._seconds = self._seconds, {}
         return taken

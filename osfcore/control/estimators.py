@@ -1,4 +1,4 @@
-"""How a closed loop estimates: its three estimators with their configurations; and its parts that can be replaced."""
+"""The estimators of a closed loop, its parts that can be replaced, and the models of its objects."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from osfcore.plugins import PartKind
 
 @dataclass(frozen=True)
 class Estimators:
-    """The estimators of ours; others derive from it.
+    """The estimators of an episode. Derive from this class to replace some of them.
 
     Attributes:
-        first: of the first frame.
-        later: of all frames after it.
-        goal: of the goal image, and of the search for lost objects.
+        first: settings of the first frame.
+        later: settings of all later frames.
+        goal: settings of the goal image, and of the search for lost objects.
     """
 
     first: FirstFrameConfig = field(default_factory=FirstFrameConfig)
@@ -45,7 +45,7 @@ class Estimators:
     def first_frame(
         self, models: ObjectModels, observation: Observation, rng: np.random.Generator
     ) -> Iterator[EstimateStep]:
-        """Poses and light of the first frame, which has masks."""
+        """Estimate poses and light from the first frame, which has masks."""
         return estimate_first(models, observation, rng, self.first)
 
     def later_frame(
@@ -56,12 +56,12 @@ class Estimators:
         rng: np.random.Generator,
         usual: Float[np.ndarray, "N"] | None = None,
     ) -> Iterator[EstimateStep]:
-        """Poses and light of a frame without masks, from the last estimate or what was predicted from it."""
+        """Estimate poses and light from a frame without masks, starting at an expected state (see `estimate_next`)."""
         return estimate_next(models, observation, expected, rng, self.later, usual=usual)
 
     @staticmethod
     def with_known_lights(light: Light, goal_light: Light) -> Estimators:
-        """Estimators of poses alone, which take the lights of scene and goal image for known."""
+        """Return estimators that estimate poses only, with known lights of the scene and the goal image."""
         held, goal_held = (tuple(float(x) for x in one.direction) for one in (light, goal_light))
         return Estimators(
             FirstFrameConfig(held_light=held),  # pyright: ignore[reportArgumentType]
@@ -73,18 +73,18 @@ class Estimators:
 ESTIMATOR = PartKind("estimator", ("first_frame", "later_frame"))
 
 
-# By name, how to make estimators from the data directory.
+# Factories of estimators by name; they take the data directory.
 ESTIMATORS: Mapping[str, Callable[[Path], Estimators]] = {"ours": lambda _data_dir: Estimators()}
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeParts:
-    """Parts of a closed loop that can be replaced.
+    """Parts of an episode that can be replaced.
 
     Attributes:
-        estimators: how everything is estimated.
-        planner: makes what decides about actions.
-        cost: makes what compares futures, anew for each plan; None for what the settings say.
+        estimators: the estimators.
+        planner: factory of the planner.
+        cost: factory of the cost, called for each plan; None for the cost that the episode's settings name.
     """
 
     estimators: Estimators = field(default_factory=Estimators)
@@ -97,14 +97,19 @@ class EpisodeParts:
 
 @dataclass(frozen=True, slots=True)
 class SceneModels:
-    """Models of the objects, loaded before the first image.
+    """All models of the objects that an episode needs. `load_scene_models` makes them.
 
     Attributes:
-        appearance: how objects and table look.
-        dynamics: what pushes do.
-        pushes: the network that proposals are drawn by, whatever predicts them.
-        shapes: of the objects, by name.
-        symmetries: which of their orientations look the same; none for those left out.
+        appearance: models of how the objects and the table look.
+        dynamics: model of what pushes do, which the planner predicts with.
+        pushes: learned dynamics model from which pushes are proposed. It may differ from `dynamics`.
+        shapes: shapes of the objects, by name.
+        symmetries: orientations of each object that look the same, by name; none for objects that are left out.
+
+    Example:
+        >>> scene_models = load_scene_models((name,), fields, assets, None)
+        >>> scene_models.symmetries[name].kind
+        'none'
     """
 
     appearance: ObjectModels
@@ -117,18 +122,22 @@ class SceneModels:
 def load_scene_models(
     names: tuple[str, ...], fields: FieldLibrary, assets: AssetLibrary, data_dir: Path | None, device: str = "cpu"
 ) -> SceneModels:
-    """Load the models of some objects.
+    """Load all models of some objects that an episode needs.
 
     Args:
-        names: of the objects.
+        names: names of the objects.
         fields: library of their fields.
         assets: library of their symmetries.
-        data_dir: whose weights and convex parts come before the installed ones.
-        device: that computes.
+        data_dir: DATA_DIR; its trained dynamics model and convex parts are used instead of the shipped ones.
+        device: "cpu", or "cuda" for a GPU.
 
     Raises:
-        UnknownName: if one has no field.
+        UnknownName: if an object has no field.
         CorruptFile: if a file is broken.
+
+    Example:
+        >>> load_scene_models((name,), fields, assets, None).pushes.names
+        ('006_mustard_bottle',)
     """
     shapes = load_shapes(data_dir, fields, names)
     pushes = PushModel(read_network(network_path(data_dir)), shapes, device)

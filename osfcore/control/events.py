@@ -1,4 +1,4 @@
-"""What an episode yields, and what can be chosen about it."""
+"""Events and settings of an episode."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from osfcore.geometry.states import EstimatedState, Observation, SceneState
 from osfcore.planning.costs import PoseGoal
 from osfcore.planning.mppi import PlanRound, PlanSettings
 
-# What an episode yields: everything that a page, a report or a test may want to know, as it happens.
+# Events of an episode, in the order in which they happen.
 
 
 Look = Literal["first", "goal", "next", "search"]
@@ -30,7 +30,7 @@ class Observed:
 
     Attributes:
         number: actions executed so far.
-        observation: what they and the robot report.
+        observation: the images, and the pusher as the robot reports it.
     """
 
     number: int
@@ -39,14 +39,14 @@ class Observed:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Looking:
-    """An estimator is at work.
+    """An estimator took a step.
 
     Attributes:
         number: actions executed so far.
-        look: at the first frame, at the goal image, at a later frame, or for something that was lost.
-        step: of the estimator.
-        rendered: the best scene so far as each camera would see it, by camera; empty until something renders it.
-        difference: of that from the images, root of the mean square over all pixels and colours, 0 to 1.
+        look: what is estimated: the "first" frame, the "goal" image, the "next" frame, or a lost object ("search").
+        step: step of the estimator.
+        rendered: renderings of the best scene so far, 8-bit RGB, by name of the camera; empty until they are made.
+        difference: root mean square difference between renderings and images, over all pixels and colours, in [0, 1].
     """
 
     number: int
@@ -58,14 +58,14 @@ class Looking:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GoalFound:
-    """Where everything should be.
+    """The goal poses are known.
 
     Attributes:
-        goal: the poses.
-        image: how that looks, through the camera: the goal image, or the poses rendered.
-        camera: of the image.
-        estimate: what the goal image was taken for; None where poses were given.
-        photo: a photograph of the poses through the camera, to look at; None where there is none.
+        goal: the goal poses.
+        image: the goal image, or a rendering of the goal poses; linear RGB in [0, 1].
+        camera: camera of the image.
+        estimate: estimate from the goal image; None if the goal was given as poses.
+        photo: a photograph that the goal poses were found in, for people to look at; None if there is none.
     """
 
     goal: PoseGoal
@@ -77,11 +77,11 @@ class GoalFound:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Planning:
-    """A round of planning is done; the last one before `ActionExecuted` holds the plan.
+    """A round of planning is done. The last one before `ActionExecuted` holds the plan.
 
     Attributes:
         number: actions executed so far.
-        round: of the planner.
+        round: result of the round.
     """
 
     number: int
@@ -90,11 +90,11 @@ class Planning:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ActionExecuted:
-    """An action was executed.
+    """The world executed an action.
 
     Attributes:
-        number: of actions executed, this one included.
-        action: velocity of the pusher [m/s].
+        number: actions executed so far, including this one.
+        action: velocity (vx, vy, 0) of the pusher in the world [m/s].
     """
 
     number: int
@@ -103,17 +103,17 @@ class ActionExecuted:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stepped:
-    """One round of the loop is over, or the loop is about to begin.
+    """A round of the loop has ended. The first of these events comes before the first round.
 
     Attributes:
         number: actions executed so far.
-        steps: actions at most; more once a disturbance was noticed.
-        estimate: where everything is now.
-        offsets_m: of each object from where it should be, on the table's plane [m]; empty where that is not known.
-        offsets_rad: likewise its orientation [rad].
-        image_cost: mean squared difference between the goal image and the estimate rendered under its light.
-        rendered: that rendering.
-        seconds: spent on each stage of this round: "first", "goal", "estimate", "plan", "act"; those that there were.
+        steps: largest number of actions. It grows when a disturbance is noticed.
+        estimate: estimate of the present state.
+        offsets_m: distance of each object from its goal on the table's plane [m]; empty if it is not known.
+        offsets_rad: angle of each object from its goal orientation [rad]; empty if it is not known.
+        image_cost: mean squared difference between the goal image and the estimate, rendered under the goal's light.
+        rendered: that rendering, linear RGB in [0, 1].
+        seconds: time spent on each stage of this round [s]: "first", "goal", "estimate", "plan" or "act".
     """
 
     number: int
@@ -128,13 +128,13 @@ class Stepped:
 
 @dataclass(frozen=True, slots=True)
 class Noticed:
-    """Something that a person should know.
+    """A message that a person should read.
 
     Attributes:
         number: actions executed so far.
-        matter: what kind of thing.
-        text: a sentence.
-        names: objects it is about.
+        matter: the kind of message.
+        text: the message, one sentence.
+        names: names of the objects that it is about.
     """
 
     number: int
@@ -145,13 +145,13 @@ class Noticed:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Finished:
-    """The last event.
+    """The episode has ended. This is the last event.
 
     Attributes:
         number: actions executed.
-        outcome: how it ended.
-        text: a sentence.
-        state: as estimated last.
+        outcome: how the episode ended.
+        text: the outcome in one sentence.
+        state: the last estimate of the state.
     """
 
     number: int
@@ -163,7 +163,7 @@ class Finished:
 Event = Observed | Looking | GoalFound | Planning | ActionExecuted | Stepped | Noticed | Finished
 
 
-# What can be chosen about an episode, also while it runs.
+# Settings of an episode, which may change while it runs.
 
 
 CostKind = Literal["pose", "image"]
@@ -172,22 +172,27 @@ MAX_STEPS = 1000
 
 @dataclass(frozen=True, slots=True)
 class EpisodeSettings:
-    """How an episode goes.
+    """Settings of an episode.
 
     Attributes:
-        steps: actions at most, counted anew after each disturbance that is noticed. The paper has 30.
-        replan_every: actions executed of each plan (the paper's r).
-        cost: "pose" compares futures with the goal's poses, "image" their renderings with the goal image (the paper's).
-        plan: how pushes are planned.
-        planning: draw plans; where not, the last plan is followed to its end.
-        acting: execute plans; where not, the world is only watched.
-        despite_doubts: go on with a goal image that is not explained well.
-        reached_m: objects this close to their goals have arrived [m].
-        reached_rad: likewise for orientations [rad].
-        renewed: count steps anew after disturbances; off where the number of actions is what is measured.
+        steps: largest number of actions. Counting starts again after a disturbance (see `renewed`). The paper has 30.
+        replan_every: actions of each plan that are executed before the next plan (r in the paper).
+        cost: "pose" compares futures with the goal poses; "image" compares renderings of futures with the goal image,
+            as in the paper.
+        plan: settings of the planner.
+        planning: whether to make new plans. If not, the last plan is followed to its end.
+        acting: whether to execute plans. If not, the episode only observes the world.
+        despite_doubts: whether to continue if the estimate of the goal image cannot be trusted.
+        reached_m: largest distance from its goal at which an object has arrived [m].
+        reached_rad: largest angle from its goal at which an object has arrived [rad].
+        renewed: whether to count steps from 0 again after a disturbance. Turn it off to compare numbers of actions.
 
     Raises:
-        InvalidInput: naming what is out of range.
+        InvalidInput: if a value is out of range.
+
+    Example:
+        >>> EpisodeSettings(steps=30, cost="image").reached_m
+        0.008
     """
 
     steps: int = 100

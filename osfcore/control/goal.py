@@ -1,4 +1,4 @@
-"""Goals from an image or poses: occluded objects stay, symmetric orientations are equal."""
+"""Goals from an image or poses. Occluded objects stay where they are; symmetric orientations count as equal."""
 
 from __future__ import annotations
 
@@ -23,14 +23,19 @@ _STAYS_M, _STAYS_RAD = 0.006, 0.12  # a goal this close to where an object is, i
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GoalImage:
-    """A photo of how the table should look, without the pusher.
+    """An image of how the table should look, without the pusher.
 
     Attributes:
-        camera: that took it.
+        camera: camera that took the image.
         image: linear RGB in [0, 1].
 
     Raises:
         InvalidInput: if the image has another size than the camera's, or is not finite.
+
+    Example:
+        >>> image = models.together.render(SceneBatch.of(state), [goal_camera()]).rgb[0, 0]
+        >>> GoalImage(goal_camera(), image).observed(state.names).images.shape
+        (1, 128, 128, 3)
     """
 
     camera: Camera
@@ -40,18 +45,18 @@ class GoalImage:
         """Check that the camera fits."""
         size = (self.camera.height, self.camera.width, 3)
         if self.image.shape != size:
-            raise InvalidInput("shape of the goal image", self.image.shape, f"{size}, as its camera tells")
+            raise InvalidInput("shape of the goal image", self.image.shape, f"{size}, the size of its camera")
         if not np.all(np.isfinite(self.image)):
             raise InvalidInput("goal image", "not finite", "radiance in [0, 1]")
 
     def observed(self, names: tuple[str, ...]) -> Observation:
-        """The image as an estimator takes it."""
+        """Return the image as an observation of these objects, for `estimate_goal`."""
         return Observation((self.camera,), self.image[None], names, None, None, 0.0)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PhotoGoal(PoseGoal):
-    """Poses that were found in a photograph, and that photograph, as it is encoded, to look at beside the table."""
+    """Poses that were found in a photograph, and the photograph itself, in its own encoding, for people to look at."""
 
     photo: GoalImage
 
@@ -59,15 +64,16 @@ class PhotoGoal(PoseGoal):
 def prefer_current_poses(
     models: ObjectModels, goal: GoalImage, estimate: EstimatedState, now: SceneState
 ) -> EstimatedState:
-    """Change the estimate of a goal image: objects are where they are now if the image shows nothing against it.
+    """Change the estimate of a goal image: an object stays where it is now unless the image contradicts that.
 
-    What hides behind something, or lies beyond the image's border, would else be taken to wherever it hid best.
+    The image says nothing about an object that is hidden or outside it. Without this rule, such an object would be
+    moved to wherever it is hidden best.
 
     Args:
-        models: fields of the objects and the table.
-        goal: the image.
-        estimate: of the goal image.
-        now: the scene.
+        models: models of the objects and the table.
+        goal: the goal image.
+        estimate: estimate from the goal image.
+        now: present state of the scene.
     """
     views = views_of(goal.observed(estimate.state.names), FINE_SIDE, samples=2)
     params = SceneParameters.of(estimate.state, None)
@@ -82,12 +88,13 @@ def prefer_current_poses(
 
 
 def snap_near_goals(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
-    """Leave objects that are at their goals already, but for what estimates err, exactly where they are.
+    """Set the goal of each object that has arrived, within the error of estimates, to its present pose.
 
     Args:
-        goal: where each object of the state should be.
-        state: where the objects are.
-        symmetries: by object; each goal is first turned to the nearest orientation that looks the same.
+        goal: goal pose of each object of the state.
+        state: present state of the scene.
+        symmetries: symmetries of the objects, by name. Each goal is first turned to the nearest orientation that looks
+            the same.
     """
     goal = nearest_symmetric_goal(goal, state, symmetries)
     stay = {}
@@ -100,12 +107,12 @@ def snap_near_goals(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, 
 
 
 def nearest_symmetric_goal(goal: PoseGoal, state: SceneState, symmetries: Mapping[str, Symmetry]) -> PoseGoal:
-    """Replace each orientation of a goal by the one nearest to the object's own of those that look the same.
+    """Replace each goal orientation by the one nearest to the object's present orientation that looks the same.
 
     Args:
-        goal: where each object should be; positions stay.
-        state: where the objects are.
-        symmetries: by object; one that is missing here keeps its goal.
+        goal: goal pose of each object. Positions stay the same.
+        state: present state of the scene.
+        symmetries: symmetries of the objects, by name. An object that is missing keeps its goal.
     """
     turned = {}
     for name, symmetry in symmetries.items():

@@ -1,8 +1,7 @@
-"""Estimates that were made beforehand, and whether they explain what is seen now as well as what was seen then.
+"""Estimates that were made in advance, and a check that they still explain the images.
 
-An example comes with the estimates of its first frame and of its goal image, so that it need not be looked at for
-half a minute. They are used only where they fit: residuals of the fields rendered there are compared with those
-of then.
+An example comes with estimates of its first frame and of its goal image, which saves half a minute. An estimate is used
+only if its residuals in the present images are about as small as in the images that it was made from.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ _WORSE, _NOISE = 1.2, 0.004  # by how much a residual may exceed the former one:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PreparedLook:
-    """An estimate and how well it explained the images that it was made from.
+    """An estimate, and how well it explained the images that it was made from.
 
     Attributes:
-        estimate: of poses and light.
-        residuals: RMS of each object there [radiance], see `expected_residuals`.
+        estimate: estimate of poses and light.
+        residuals: residual of each object in those images [radiance], see `expected_residuals`.
     """
 
     estimate: EstimatedState
@@ -39,11 +38,11 @@ class PreparedLook:
 
     @staticmethod
     def of(models: ObjectModels, observation: Observation, estimate: EstimatedState) -> PreparedLook:
-        """Keep an estimate of an observation, and how well it explains it, for later."""
+        """Store an estimate from an observation together with its residuals there."""
         return PreparedLook(estimate, expected_residuals(models, observation, estimate.state))
 
     def explains(self, models: ObjectModels, observation: Observation) -> bool:
-        """Decide whether it fits an observation of these objects about as well as the one that it was made from."""
+        """Return whether the estimate fits this observation about as well as the one that it was made from."""
         state = self.estimate.state
         if state.names != observation.names:
             return False
@@ -53,18 +52,18 @@ class PreparedLook:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PreparedLooks:
-    """Estimates that were made beforehand of a table and its goal image.
+    """Estimates of a table and its goal image that were made in advance.
 
     Attributes:
-        first: of the first frame.
-        goal: of the goal image.
+        first: estimate of the first frame.
+        goal: estimate of the goal image.
     """
 
     first: PreparedLook
     goal: PreparedLook
 
     def step(self, look: str, models: ObjectModels, observation: Observation) -> EstimateStep | None:
-        """Return the result of a look, "first" or "goal", if it explains what is seen; else None."""
+        """Return the estimate for "first" or "goal" if it explains the images; else None."""
         prepared = self.first if look == "first" else self.goal
         if not prepared.explains(models, observation):
             return None

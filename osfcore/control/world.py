@@ -1,4 +1,4 @@
-"""What a tabletop with a pusher must offer, so that a real robot can stand in for the simulator."""
+"""The methods that a tabletop with a pusher must have, so that a robot can replace the simulator."""
 
 from __future__ import annotations
 
@@ -13,51 +13,51 @@ from osfcore.geometry.states import Observation, SceneState
 
 
 class World(Protocol):
-    """A table with objects, cameras and one pusher that follows velocities.
+    """A table with objects, cameras, and one pusher that follows velocities.
 
-    The simulator (`osfcore.world.tabletop.Tabletop`) is one implementation. Nothing here gives poses or depth: whoever
-    plans has to see.
+    The simulator (`osfcore.world.tabletop.Tabletop`) is one implementation; a real robot can be another. A world
+    returns no poses and no depth, so that an episode has to estimate them from images.
     """
 
     def reset(self, seed: int) -> Observation:
-        """Put a scene on the table: the same for the same seed where the world can (a robot may ask a person)."""
+        """Arrange a scene and observe it. In simulation a seed repeats its scene; a robot may ask a person for help."""
         ...
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """Take an image with every camera, with object masks on demand (a robot may have none: then None)."""
+        """Take an image with every camera. With `masks`, add object masks if this world can make them, else None."""
         ...
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
-        """Hold the pusher velocity (vx, vy, 0) [m/s] for `STEP_S` [s].
+        """Move the pusher with velocity (vx, vy, 0) in the world [m/s] for 0.2 s.
 
         Raises:
-            InvalidInput: if the action is outside its limits; the world is unchanged.
+            InvalidInput: if the action is outside its limits. The world is then unchanged.
         """
         ...
 
     def close(self) -> None:
-        """Release what the world holds. Calling it again does nothing."""
+        """Release the resources of the world. Calling it again does nothing."""
         ...
 
 
 class SimulatedWorld(World, Protocol):
-    """A world that knows the truth, for reports; nothing that estimates or plans asks for it."""
+    """A world that also knows the true state. Only reports use it; estimators and planners do not."""
 
     def truth(self) -> SceneState:
-        """Where everything truly is."""
+        """Return the true state of the scene."""
         ...
 
     def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
-        """Take an image with any cameras."""
+        """Take an image with each of these cameras."""
         ...
 
 
-# Observations for the estimators of a closed loop: cameras that see something, at the brightness of the first images.
+# Observations for the estimators of an episode: without covered cameras, and at the brightness of the first images.
 #
-# A covered camera shows one colour; its image would pull every estimate. A lamp that is dimmed makes all of an
-# image darker by one factor, lit and shadowed parts alike, while one that is moved does not: its shadows keep their
-# radiance and lie elsewhere. So a common factor is taken out of the images, and anything else is left to the search
-# for the lamp.
+# A covered camera shows one colour, and its image would distort every estimate. A lamp that is dimmed makes all of an
+# image darker by one factor, lit and shadowed parts alike. A lamp that is moved does not: its shadows keep their
+# radiance and lie elsewhere. So a common factor is divided out of the images, and any other change is left to the
+# search for the lamp.
 
 
 _BLIND = 0.015  # standard deviation of an image that shows one colour [radiance]
@@ -70,11 +70,11 @@ _SHADOWED, _FEW = 0.55, 40  # of the median: pixels in shadow, if there are that
 
 @dataclass(frozen=True, slots=True)
 class SightChange:
-    """Something about the pictures that a person should know.
+    """A change in the images that a person should know about.
 
     Attributes:
-        matter: what it is about.
-        text: a sentence.
+        matter: the kind of change.
+        text: the message, one sentence.
     """
 
     matter: Literal["camera", "brightness"]
@@ -82,7 +82,7 @@ class SightChange:
 
 
 class Sight:
-    """Prepares one observation after the other."""
+    """Prepares observations for the estimators, one after the other."""
 
     def __init__(self) -> None:
         self._brightness = 1.0
@@ -90,10 +90,10 @@ class Sight:
         self._before: Observation | None = None
 
     def take(self, observation: Observation) -> tuple[Observation, tuple[SightChange, ...]]:
-        """Return what an estimator should see of an observation, and what has changed about it."""
+        """Return an observation as an estimator should receive it, and the changes since the last one."""
         blind = blind_cameras(observation)
         lost, back = sorted(blind - self._blind), sorted(self._blind - blind)
-        changes = [SightChange("camera", f"Camera {name} sees nothing; going on with the others.") for name in lost]
+        changes = [SightChange("camera", f"Camera {name} sees nothing; continuing with the others.") for name in lost]
         changes += [SightChange("camera", f"Camera {name} sees again.") for name in back]
         self._blind = blind
         seen = without_cameras(observation, blind)
@@ -102,7 +102,7 @@ class Sight:
         if factor is not None:
             self._brightness *= factor
             share = f"{100 * self._brightness:.0f} %"
-            changes.append(SightChange("brightness", f"The light is at {share} of what it was; allowed for."))
+            changes.append(SightChange("brightness", f"The light is at {share} of its first brightness."))
         if abs(np.log(self._brightness)) < _CHANGE / 2:
             self._brightness = 1.0
         images = np.clip(seen.images / np.float32(self._brightness), 0, 1)
@@ -110,14 +110,14 @@ class Sight:
 
 
 def blind_cameras(observation: Observation) -> frozenset[str]:
-    """Return names of cameras whose images show one colour; none if fewer than two others are left."""
+    """Return the names of cameras whose images show a single colour; none if fewer than two others remain."""
     spread = observation.images.std(axis=(1, 2)).max(axis=1)
     names = frozenset(c.name for c, one in zip(observation.cameras, spread, strict=True) if one < _BLIND)
     return names if len(observation.cameras) - len(names) >= _FEWEST else frozenset()
 
 
 def without_cameras(observation: Observation, names: frozenset[str]) -> Observation:
-    """Leave some views out of an observation."""
+    """Return an observation without some of its views."""
     kept = [v for v, camera in enumerate(observation.cameras) if camera.name not in names]
     if len(kept) == len(observation.cameras):
         return observation
@@ -127,11 +127,11 @@ def without_cameras(observation: Observation, names: frozenset[str]) -> Observat
 
 
 def brightness_change(before: Observation, now: Observation) -> float | None:
-    """Measure the factor by which everything became brighter; None if it did not, or not everything alike.
+    """Return the factor by which all pixels became brighter; None if it is close to 1 or pixels disagree.
 
     Args:
         before: an observation.
-        now: a later one; cameras that are in both are compared.
+        now: a later observation. Cameras that both have are compared.
     """
     views = [(a, b) for a, x in enumerate(before.cameras) for b, y in enumerate(now.cameras) if x.name == y.name]
     if not views:

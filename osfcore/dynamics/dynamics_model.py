@@ -1,4 +1,4 @@
-"""What planning, control and the command line need of a model of dynamics, whichever it is."""
+"""The interface of dynamics models, for planning, control and the command line."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from osfcore.geometry.states import SceneState
 
 
 class DynamicsModel(Protocol):
-    """Predicts what pushes do: our `PushModel`, or the paper's (`osfcore.paper.dynamics`)."""
+    """A model that predicts the effect of pushes: `PushModel`, or the paper's (`osfcore.paper.dynamics`)."""
 
     device: torch.device
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Objects that it can predict."""
+        """Names of the objects that it can predict."""
         ...
 
     def rollout(
@@ -28,8 +28,8 @@ class DynamicsModel(Protocol):
         """Predict poses under K sequences of T actions.
 
         Args:
-            state: of the scene, with its pusher.
-            actions: velocities (vx, vy, 0) of the pusher [m/s], each held for 0.2 s.
-            before: the same objects one action ago, for models that consider how things move.
+            state: state of the scene, with a pusher.
+            actions: velocities (vx, vy, 0) of the pusher in the world [m/s], each held for 0.2 s.
+            before: state of the same objects one action earlier, for models that use velocities.
         """
         ...

@@ -51,11 +51,10 @@ from osfcore.io.files import write_atomically
 #
 #     A_ij = 1 if ||p_i - p_j|| < kappa, i != j
 #
-# Deviation: eq. 8 compares a squared distance with a length; we compare the distance of two objects with kappa =
-# the longest half-extents of both + one step of pusher travel. Among the pairs that pass, and between pusher and
-# objects, outlines seen from above (`shapes`) then decide which can touch within one substep. Only
-# objects that the pusher can touch, or that move, or that can be touched by one of these, take part; all others
-# stay exactly where they are.
+# Deviation: eq. 8 compares a squared distance with a length. Here the distance of two objects is compared with kappa =
+# the longest half-extents of both + one step of pusher travel. Outlines seen from above (`shapes`) then decide which of
+# these pairs, and which objects with the pusher, can touch within one substep. Only objects that the pusher can touch,
+# that move, or that one of these can touch take part. All others keep their poses exactly.
 
 
 TRAVEL_M = MAX_SPEED_M_S * STEP_S  # of the pusher in one step, per axis
@@ -67,19 +66,19 @@ class Graph(NamedTuple):
 
     Attributes:
         scene: scene of each of the A objects.
-        slot: its place among the scene's objects.
-        number: its shape.
+        slot: index of each among the scene's objects.
+        number: index of its shape.
         frame: rotation from the world to the heading's frame.
-        rotation: from the object's frame to the heading's.
-        centre: of mass [m].
+        rotation: rotation from the object's frame to the heading's.
+        centre: centre of mass [m].
         linear: displacement of the last substep [m].
         angular: rotation vector of the last substep [rad].
-        outline: seen from above [m].
-        shift: of the pusher in this substep [m].
-        touched: which objects the pusher can touch.
-        pusher: where, if so.
-        receiver, sender: numbers among the A objects, for each of the E ordered pairs that can touch.
-        pair: where each such pair can touch, out of the receiver.
+        outline: outline seen from above [m].
+        shift: shift of the pusher in this substep [m].
+        touched: whether the pusher can touch each object.
+        pusher: contact with the pusher, for objects that it can touch.
+        receiver, sender: indices among the A objects, for each of the E ordered pairs that can touch.
+        pair: contact of each such pair, with its normal out of the receiver.
     """
 
     scene: Int[Tensor, "A"]
@@ -105,9 +104,9 @@ def adjacency(
     """Return which objects could collide during a step (paper eq. 8, with the deviation stated above).
 
     Args:
-        position: of the centres [m].
+        position: position of the centres [m].
         half_extent: longest half-extent of each object [m].
-        travel_m: of the pusher in one step [m].
+        travel_m: travel of the pusher in one step [m].
     """
     distance = (position[:, :, None] - position[:, None]).norm(dim=-1)
     kappa = half_extent[:, :, None] + half_extent[:, None] + travel_m
@@ -177,7 +176,7 @@ def _candidate_pairs(table: ShapeTable, number: Int[Tensor, "B N"], motion: Moti
 def _extent(
     table: ShapeTable, number: Tensor, motion: Motion, rows: Sequence[Tensor], direction: Float[Tensor, "R 2"]
 ) -> Float[Tensor, "R"]:
-    """Return how far some objects reach horizontally from their centres of mass in one direction each [m]."""
+    """Return the horizontal extent of objects from their centres of mass, in one direction each [m]."""
     length = direction.norm(dim=1, keepdim=True)
     unit = torch.where(length > 1e-6, direction / length.clamp(min=1e-6), direction.new_tensor([1.0, 0.0]))
     directions = functional.pad(unit, (0, 1))[:, None]
@@ -240,11 +239,11 @@ def _keep(graph: Graph, first: Tensor, second: Tensor, contact: PairContact, kep
     return Graph._make([*objects, torch.cat([first, second]), torch.cat([second, first]), pair])
 
 
-# What the network sees of a graph: numbers along each object's own direction of push, from its centre of mass.
+# Features of a graph, along each object's own direction of push and from its centre of mass.
 #
 # Every object has a frame of its own: x points along the normal of the contact that pushes it most directly, z up.
-# All vectors that reach an object are in its frame and so is its answer, so a scene that is turned or shifted gives
-# the same numbers.
+# All input vectors of an object and its output are in this frame, so that a turned or shifted scene gives the same
+# numbers.
 
 
 AROUND = 16  # horizontal directions in which an object's extent is a feature
@@ -262,15 +261,15 @@ EDGE_FEATURES = 35
 
 
 class Inputs(NamedTuple):
-    """A graph in numbers.
+    """Features of a graph.
 
     Attributes:
-        nodes: of each object.
-        edges: from the pusher to the objects it can touch, then between objects.
+        nodes: features of each object.
+        edges: features of the edges from the pusher to the objects it can touch, then between objects.
         receiver: object at the end of each edge.
         sender: object at the beginning of each edge between objects.
         frame: rotation from the world to each object's frame.
-        quasistatic: how the pusher would make each object slide without inertia: x, y, turn, in units of the answer.
+        quasistatic: quasi-static sliding of each object under the pusher: x, y, turn, in units of the output.
     """
 
     nodes: Float[Tensor, "A F"]
@@ -282,7 +281,7 @@ class Inputs(NamedTuple):
 
 
 def inputs(table: ShapeTable, graph: Graph) -> Inputs:
-    """Return the numbers that the network sees of a graph."""
+    """Return the features of a graph."""
     turn = rotations.facing(_directions(graph))
     quasistatic = _quasistatic_sliding(graph, graph.pusher.after, turn)
     pushed = graph.touched.nonzero()[:, 0]
@@ -298,7 +297,7 @@ def corrections(features: Inputs) -> Float[Tensor, "A 6"]:
 
 
 def _directions(graph: Graph) -> Float[Tensor, "A 2"]:
-    """Return where each object is pushed to: by the pusher, else by the closest object, else where it is moving."""
+    """Return the direction of each object's push: by the pusher, or by the closest object, or of its own motion."""
     flat = graph.linear[:, :2]
     speed = flat.norm(dim=1, keepdim=True)
     moving = torch.where(speed > 1e-6, flat / speed.clamp(min=1e-6), flat.new_tensor([1.0, 0.0]))
@@ -537,7 +536,7 @@ def parameter_bytes(network: nn.Module, metadata: Mapping[str, str]) -> bytes:
 
 
 def write_network(path: Path, network: PropagationNetwork) -> None:
-    """Write a network; the file appears only when it is whole.
+    """Write a network. The file appears only once it is complete.
 
     Raises:
         CannotWrite: if the disk refuses.
@@ -549,7 +548,7 @@ def read_network(path: Path) -> PropagationNetwork:
     """Read a network.
 
     Raises:
-        CorruptFile: if the file is missing, cut short, of another version or no such network.
+        CorruptFile: if the file is missing, truncated, of another version or no such network.
     """
     metadata, values = read_parameters(path, FORMAT, "network of pushes")
     network = PropagationNetwork(*described_sizes(metadata, path))
@@ -566,7 +565,7 @@ def described_sizes(metadata: Mapping[str, str], path: Path) -> tuple[int, int]:
     try:
         hidden, steps = int(metadata["hidden"]), int(metadata["steps"])
     except (KeyError, ValueError) as error:
-        raise CorruptFile(path, f"it holds no network of pushes of known size ({shown(error)})") from error
+        raise CorruptFile(path, f"it holds no push network of a known size ({shown(error)})") from error
     if not (1 <= hidden <= _MOST_HIDDEN and 1 <= steps <= _MOST_STEPS):
         raise CorruptFile(path, f"{hidden} units and {steps} steps are out of range")
     return hidden, steps
@@ -664,7 +663,7 @@ def unroll(
         table: shapes of the objects.
         number: which of them each object is.
         motion: the scenes before the first action.
-        velocity: of the pusher in each action [m/s].
+        velocity: velocity of the pusher in each action [m/s].
         mirror: scenes to reflect along the heading, in training.
     """
     path = pusher_path(motion.pusher.double().cpu().numpy(), velocity.transpose(0, 1).double().cpu().numpy())

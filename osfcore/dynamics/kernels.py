@@ -1,6 +1,6 @@
 """Rollouts of many scenes, compiled for the CPU: contacts, features, network and motion of each substep.
 
-The same numbers as `graph.py` in PyTorch, which training needs for its gradients; `rollout.py` alone calls it.
+It computes the same as `graph.py` in PyTorch, which training needs for its gradients. Only `rollout.py` calls it.
 """
 
 # ruff: noqa: ANN001, ANN201, ANN202, D417 - compiled helpers; types are given by their callers
@@ -97,7 +97,7 @@ class Memory(namedtuple("Memory", "nodes edges receiver sender own state effect 
         nodes, edges: features, `NODE_WIDTH` and `EDGE_WIDTH` a row.
         receiver, sender: node at the end and at the beginning of each edge, -1 for the pusher.
         own, state, effect: of nodes.
-        relation: of edges.
+        relation: state of edges.
         a, b, c: of nodes or edges.
         motion: the answer, `MOTION_WIDTH` a row.
     """
@@ -466,7 +466,7 @@ class Contacts(
         outline_x, outline_y: seen from above.
         first, many: its first convex part and how many it has; -1 before they are drawn.
         part_x, part_y, low, high: of the parts: outlines, lowest and highest point.
-        reach: of each part in all directions of the circle.
+        reach: reach of each part in all directions of the circle.
         before, halfway, after: gaps to the pusher's rim at its start, halfway and at its end; `face` at its start.
         moving, near, possible, touched, awake: whether it moves, may be touched by the pusher, may take part at all, is
             touched, takes part.

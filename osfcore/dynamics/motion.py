@@ -52,10 +52,10 @@ def push_motion(
     """Return the motion of an object pushed at a contact: displacement (x, y) [m] and turn about the vertical [rad].
 
     Args:
-        point: of contact, from the centre of friction [m].
+        point: point of contact, from the centre of friction [m].
         inward: normal into the object.
         depth: how far the contact must move along the normal [m].
-        shift: of what pushes; its tangential part drags the contact along while friction holds [m].
+        shift: shift of what pushes; its tangential part drags the contact along while friction holds [m].
         arm: c, moment over force that friction with the table can hold [m].
 
     Returns:
@@ -89,7 +89,7 @@ SUBSTEPS = 4  # of one action: the pusher travels 6 cm in one, too far to see co
 def pusher_path(
     start: Float[np.ndarray, "*#batch 2"], velocity: Float[np.ndarray, "*batch T 2"]
 ) -> Float[np.ndarray, "*batch S1 2"]:
-    """Return the pusher's centre before the first and after each substep [m]; it stops where its reach ends."""
+    """Return the pusher's centre before the first and after each substep [m]. It stops at the border of its reach."""
     place = np.broadcast_to(np.asarray(start, float), (*velocity.shape[:-2], 2))
     reach = np.maximum(PUSHER_REACH_M, np.abs(place))
     path = [place]
@@ -113,7 +113,7 @@ def substates(episode: PushEpisode) -> Pose:
     """Return all poses of an episode, substep by substep.
 
     Raises:
-        InvalidInput: if it was recorded without them.
+        InvalidInput: if it was recorded without poses of its substeps.
     """
     if episode.sub_positions is None or episode.sub_quaternions is None or episode.sub_positions.shape[1] != SUBSTEPS:
         raise InvalidInput("push file", "without poses within its actions", "one that 'osf collect pushes' wrote")
@@ -131,20 +131,20 @@ def is_on_table(episode: PushEpisode) -> Bool[np.ndarray, "T1"]:
 # The state of B scenes of N objects while they are rolled out, and what the pusher does in them.
 
 
-_MOVED_M, _MOVED_RAD = 1e-3, 0.02  # during an action: less is taken for rest
+_MOVED_M, _MOVED_RAD = 1e-3, 0.02  # during an action: an object that moves less counts as resting
 ASIDE = 0.035  # about a cell of the map of directions [rad]
 
 
 class Motion(NamedTuple):
-    """Where everything is and how it moved last, in world coordinates.
+    """State and last motion of all objects, in world coordinates.
 
     Attributes:
         centre: centres of mass [m].
-        quaternion: orientations, unit.
+        quaternion: orientations, unit quaternions (w, x, y, z).
         linear: displacement of the centres during the last substep [m].
         angular: rotation vectors of the last substep [rad].
         pusher: horizontal position of the pusher's centre [m].
-        floor: how low the lowest point of each object may come: 0, or less where it was estimated lower [m].
+        floor: least height of the lowest point of each object [m]: 0, or less if it was estimated lower.
     """
 
     centre: Float[Tensor, "B N 3"]
@@ -156,11 +156,11 @@ class Motion(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """What the pusher does in one substep.
+    """Motion of the pusher in one substep.
 
     Attributes:
-        heading: unit vector of its commanded velocity; any where it stands still.
-        shift: its displacement [m]; shorter than commanded where its reach ends.
+        heading: unit vector of its commanded velocity; arbitrary if it stands still.
+        shift: its displacement [m]. It is shorter than commanded at the border of its reach.
     """
 
     heading: Float[Tensor, "B 2"]
@@ -172,13 +172,13 @@ def lowest_point(
 ) -> Float[Tensor, "A"]:
     """Return the height of the lowest point of each object over the table's top [m].
 
-    The lowest of what is farthest straight down and in directions around it: one alone may find the wrong end of a face
-    that hardly tilts.
+    It is the lowest of the farthest points straight down and in directions around that. A single direction may find the
+    wrong end of a face that hardly tilts.
 
     Args:
         table: shapes of the objects.
         number: which of them each object is.
-        centre: of mass, in the world [m].
+        centre: centre of mass, in the world [m].
         quaternion: orientations in the world, unit.
     """
     around = functional.pad(ASIDE * circle(8, centre.device), (0, 1), value=-1.0)
@@ -187,9 +187,9 @@ def lowest_point(
 
 
 def headings(velocity: Float[Tensor, "B 2"], motion: Motion) -> Float[Tensor, "B 2"]:
-    """Return the directions of the pusher's velocities; where it stands still, of the fastest object.
+    """Return the directions of the pusher's velocities; if it stands still, of the fastest object.
 
-    Everything the network sees is turned into this direction, so that turning the scene turns the prediction.
+    All features are rotated into this direction, so that rotating the scene rotates the prediction.
     """
     speed = velocity.norm(dim=1, keepdim=True)
     fastest = motion.linear[..., :2].norm(dim=2).argmax(dim=1)
@@ -201,10 +201,10 @@ def headings(velocity: Float[Tensor, "B 2"], motion: Motion) -> Float[Tensor, "B
 
 
 def going_on(former: Motion, motion: Motion) -> Motion:
-    """Return the scenes with velocities by how things moved since the former ones, one action ago.
+    """Return the scenes with velocities from the motion since the former ones, one action earlier.
 
-    The mean over the action stands for its last substep. (To predict that action again and take its last substep is
-    less exact, see docs/notes/dynamics.md.) What moved by less than an estimate may err is at rest.
+    The mean over the action is used for its last substep. (Predicting the action again and taking its last substep is
+    less exact, see docs/notes/dynamics.md.) An object that moved less than the error of an estimate is at rest.
     """
     opposite = former.quaternion * former.quaternion.new_tensor([1.0, -1.0, -1.0, -1.0])
     turn = rotations.logarithm(rotations.multiply(motion.quaternion, opposite))

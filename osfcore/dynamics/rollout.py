@@ -31,18 +31,28 @@ _BLOCK = 40  # scenes whose objects go through the compiled network together, at
 
 
 class PushModel:
-    """The dynamics model: a trained network with the shapes of its objects.
+    """The learned dynamics model: a graph network that predicts the motion of objects under pushes.
 
-    On CPUs rollouts are compiled (`kernels`), unless the width of the network is no multiple of four; they are those of
-    torch but for rounding.
+    On a CPU it runs compiled code, which gives the same results as PyTorch up to rounding. A network whose width is no
+    multiple of four runs in PyTorch.
 
     Args:
-        network: predicts the motion of one substep.
-        shapes: of all objects that may occur, by name.
-        device: that computes.
+        network: network that predicts the motion of one substep.
+        shapes: shapes of all objects that may occur, by name.
+        device: PyTorch device.
 
     Raises:
         InvalidInput: if there are no shapes.
+
+    Example:
+        >>> push_model = load_push_model(None, fields, [name])
+        >>> actions = np.zeros((2, 5, 3))  # two sequences of five actions; the second one waits
+        >>> actions[0, :, 0] = 0.15  # [m/s] toward the bottle
+        >>> futures = push_model.rollout(state, actions)
+        >>> futures.positions.shape
+        (2, 6, 1, 3)
+        >>> futures.positions[:, -1, 0, 0] > 0.01  # whether the bottle moved by 1 cm
+        array([ True, False])
     """
 
     def __init__(
@@ -60,7 +70,7 @@ class PushModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Objects whose shapes are known."""
+        """Names of the objects whose shapes are known."""
         return self._names
 
     def rollout(
@@ -70,20 +80,24 @@ class PushModel:
         before: SceneState | None = None,
         pushers: Float[np.ndarray, "K 2"] | None = None,
     ) -> Rollouts:
-        """Predict poses under K sequences of T actions.
+        """Predict the poses of all objects under K sequences of T actions.
 
-        Objects are put into the order of their names inside, so that the order in which they come never matters. What
-        nothing can touch keeps its pose bit by bit.
+        The order of the objects in the state does not change the result. An object that nothing can touch keeps exactly
+        its pose.
 
         Args:
-            state: of the scene, with its pusher.
-            actions: velocities (vx, vy, 0) of the pusher [m/s], each held for 0.2 s.
-            before: the same objects one action ago, if something may still be moving; else everything is at rest.
-            pushers: where the pusher begins each sequence, if not where it is [m].
+            state: state of the scene, with a pusher.
+            actions: velocities (vx, vy, 0) of the pusher in the world [m/s]. Each action is held for 0.2 s;
+                vx and vy are at most 0.3 in size.
+            before: state of the same objects one action earlier, which gives their velocities; at rest if None.
+            pushers: x and y of the pusher at the beginning of each sequence [m]; as in the state if None.
+
+        Returns:
+            The K futures, with poses before the first and after each action.
 
         Raises:
-            InvalidInput: if there are no objects or no pusher, or actions have another shape, are too many, not finite
-                or beyond the limits; nothing is clipped.
+            InvalidInput: if there are no objects or no pusher, or the actions have another shape, are too many, not
+                finite or beyond the limits. Actions are never clipped.
             UnknownName: if the shape of an object is not known.
         """
         actions = check_actions(actions)
@@ -158,12 +172,12 @@ class PushModel:
 
 
 def check_scene(state: SceneState, known: Collection[str], kind: str) -> Float[np.ndarray, "3"]:
-    """Return the pusher's centre in a scene that can be predicted [m].
+    """Check that a scene can be predicted; return the pusher's centre in the world [m].
 
     Args:
-        state: of the scene.
-        known: objects that can be predicted.
-        kind: what is known of them, for the error.
+        state: state of the scene.
+        known: names of the objects that can be predicted.
+        kind: what is known of them, such as "shape", for the error.
 
     Raises:
         InvalidInput: if there are no objects or no pusher.
@@ -172,7 +186,7 @@ def check_scene(state: SceneState, known: Collection[str], kind: str) -> Float[n
     if not state.names:
         raise InvalidInput("number of objects", 0, "at least 1")
     if state.pusher is None:
-        raise InvalidInput("pusher of the state", "missing", "given: predictions start from where it is")
+        raise InvalidInput("pusher of the state", "missing", "given, because predictions start from it")
     for name in state.names:
         if name not in known:
             raise UnknownName(kind, name, known)
@@ -182,7 +196,7 @@ def check_scene(state: SceneState, known: Collection[str], kind: str) -> Float[n
 def pusher_centres(
     begins: Float[np.ndarray, "*#batch 2"], actions: Float[np.ndarray, "K T 3"], height: float
 ) -> Float[np.ndarray, "K T1 3"]:
-    """Return the pusher's centre before the first and after each action [m], at its height."""
+    """Return the pusher's centre in the world before the first and after each action [m], at this height [m]."""
     path = pusher_path(begins, actions[..., :2])[:, ::SUBSTEPS]
     return np.concatenate([path, np.full((*path.shape[:2], 1), height)], axis=-1)
 
@@ -195,7 +209,7 @@ def _unroll_compiled(
     actions: Float[np.ndarray, "K T 3"],
     begins: Float[np.ndarray, "K 2"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what `PushModel._unroll` does, without torch; BENCHMARKS.md has what that gains."""
+    """Compute the same as `PushModel._unroll` without torch. BENCHMARKS.md has the gain in speed."""
     begins, velocity = begins.astype(np.float32), np.ascontiguousarray(actions[..., :2], np.float32)
     shifts = np.diff(pusher_path(begins, velocity.astype(float)), axis=1).astype(np.float32)
     scene = (start.centre, start.quaternion, start.linear, start.angular, start.floor)
@@ -210,33 +224,40 @@ def _unroll_compiled(
     return results
 
 
-# Which trained network and shapes there are: those of this machine, or else those that ship with the package.
+# The trained network and the shapes: those in the data directory, or else those that ship with the package.
 
 
 NETWORK_FILE = "pushes.safetensors"
 
 
 def network_path(data_dir: Path | None) -> Path:
-    """Return DATA_DIR/dynamics/pushes.safetensors if it is there, else the package's."""
+    """Return DATA_DIR/dynamics/pushes.safetensors if it exists, else the package's file."""
     own = None if data_dir is None else data_dir / "dynamics" / NETWORK_FILE
     return own if own is not None and own.is_file() else shipped()
 
 
 def load_shapes(data_dir: Path | None, fields: FieldLibrary, names: Iterable[str]) -> dict[str, ObjectShape]:
-    """Return the shapes of some objects by name, each from its field.
+    """Return the shapes of some objects, which the dynamics model and push proposals need.
 
-    A field that is seen for the first time is cut into convex parts, which takes up to half a minute; they are kept in
-    DATA_DIR/dynamics/parts.
+    Shapes are computed from fields. Dividing a new field into convex parts takes up to half a minute; the parts are
+    then stored in DATA_DIR/dynamics/parts. Parts of the shipped fields come with the package.
 
     Args:
-        data_dir: DATA_DIR; where it is None, nothing is kept.
-        fields: of the objects.
-        names: which objects.
+        data_dir: DATA_DIR; None to store nothing.
+        fields: fields of the objects.
+        names: names of the objects.
+
+    Returns:
+        The shapes by name.
 
     Raises:
         UnknownName: if an object has no field.
-        CorruptFile: if a field's file is broken.
+        CorruptFile: if the file of a field is broken.
         OsfError: if nothing in a field is solid.
+
+    Example:
+        >>> list(load_shapes(None, fields, ["006_mustard_bottle"]))
+        ['006_mustard_bottle']
     """
     return {name: _load_shape(data_dir, fields, name) for name in names}
 
@@ -260,17 +281,22 @@ def _load_shape(data_dir: Path | None, fields: FieldLibrary, name: str) -> Objec
 def load_push_model(
     data_dir: Path | None, fields: FieldLibrary, names: Iterable[str], device: torch.device | str = "cpu"
 ) -> PushModel:
-    """Return the network with the shapes of some objects, each from its field.
+    """Load the trained dynamics model for some objects.
 
     Args:
-        data_dir: as in `load_shapes`; a network in it comes before the package's.
-        fields: of the objects.
-        names: which objects.
-        device: that computes.
+        data_dir: DATA_DIR, as in `load_shapes`. Its network dynamics/pushes.safetensors, if there is one, is used
+            instead of the package's.
+        fields: fields of the objects, from which their shapes are computed.
+        names: names of the objects.
+        device: PyTorch device.
 
     Raises:
         UnknownName: if an object has no field.
         CorruptFile: if a file is broken.
         OsfError: if nothing in a field is solid.
+
+    Example:
+        >>> load_push_model(None, fields, ["006_mustard_bottle"]).names
+        ('006_mustard_bottle',)
     """
     return PushModel(read_network(network_path(data_dir)), load_shapes(data_dir, fields, names), device)

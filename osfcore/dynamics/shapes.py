@@ -46,7 +46,7 @@ class ObjectShape:
     Attributes:
         half_extents: half the sides of its bounding box, in the object's frame [m].
         centre: centre of mass of the solid, of uniform density, in the object's frame [m].
-        radius: of the sphere around the centre that holds the object [m].
+        radius: radius of the sphere around the centre that holds the object [m].
         support: farthest point from the centre in each direction of the octahedral map, relative to the centre [m].
         parts: the same of each convex part; none if the hull is good enough.
     """
@@ -62,7 +62,7 @@ def object_shape(field: KiloOSF, parts: Sequence[Float[np.ndarray, "_ 3"]] = ())
     """Return the shape that a field describes.
 
     Args:
-        field: of the object.
+        field: field of the object.
         parts: corners of convex parts that together fill it; none if its hull is good enough.
 
     Raises:
@@ -83,8 +83,8 @@ def solid_shape(
     """Return the shape of a solid whose corners are known.
 
     Args:
-        corners: of its convex hull, in the object's frame [m].
-        centre: of mass [m].
+        corners: corners of its convex hull, in the object's frame [m].
+        centre: centre of mass [m].
         parts: corners of convex parts that together fill it; none if its hull is good enough.
     """
     return ObjectShape(
@@ -144,7 +144,7 @@ class ShapeTable:
     Convex parts are bodies as well, numbered after all objects; an object without any is its own only part.
 
     Args:
-        shapes: of the objects, in the order of their numbers.
+        shapes: shapes of the objects, in the order of their numbers.
         device: that looks them up.
     """
 
@@ -169,9 +169,9 @@ class ShapeTable:
         far than the farthest ones (rms over all directions), and some millimetres less beside the normal of a face.
 
         Args:
-            number: of each body in the table.
+            number: index of each body in the table.
             rotation: from each body's frame to the world.
-            directions: of any length but 0, the same for all bodies or for each its own.
+            directions: directions of any length but 0, the same for all bodies or for each its own.
         """
         local = directions @ rotation  # R^T d for every d
         return self._support(number, local) @ rotation.transpose(1, 2)
@@ -180,7 +180,7 @@ class ShapeTable:
         """Return how far A bodies reach in D directions of the world from their centres of mass (A, D) [m].
 
         Args:
-            number: of each body in the table.
+            number: index of each body in the table.
             rotation: from each body's frame to the world.
             directions: unit vectors, the same for all bodies or for each its own.
         """
@@ -241,9 +241,9 @@ def write_parts(path: Path, parts: Parts, field_digest: str) -> None:
     """Write the parts of a field.
 
     Args:
-        path: of the file.
+        path: path of the file.
         parts: corners of each part, in the object's frame [m].
-        field_digest: of the field's file; `read_parts` refuses the parts of another.
+        field_digest: digest of the field's file; `read_parts` refuses the parts of another.
 
     Raises:
         CannotWrite: if the disk refuses.
@@ -338,8 +338,8 @@ def outlines(
     Args:
         table: shapes.
         body: rows of the table: whole objects or convex parts.
-        rotation: of each body.
-        centre: of mass of each body's object [m].
+        rotation: rotation of each body.
+        centre: centre of mass of each body's object [m].
     """
     flat = functional.pad(circle(OUTLINE, centre.device), (0, 1))
     return table.farthest(body, rotation, flat)[..., :2] + centre[:, None, :2]
@@ -371,9 +371,9 @@ def solids(
     Args:
         table: shapes.
         number: shape of each object.
-        rotation: of each object.
-        centre: of mass [m].
-        outline: of the whole objects, which serves those of one part [m].
+        rotation: rotation of each object.
+        centre: centre of mass [m].
+        outline: outline of the whole objects, which serves those of one part [m].
     """
     count = table.part_count[number]
     first = count.cumsum(0) - count
@@ -417,8 +417,8 @@ def pair_contact(
     """Return the gaps between the nearest parts of pairs of objects.
 
     Args:
-        parts: of all objects.
-        outline: of the whole objects [m].
+        parts: parts of all objects.
+        outline: outline of the whole objects [m].
         first: object of each pair.
         second: the other one.
     """

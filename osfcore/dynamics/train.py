@@ -1,10 +1,13 @@
 """Training the propagation network on recorded pushes.
 
-Deviations from the paper (section 4.3), measured in docs/notes/dynamics.md: an action is predicted in four
-substeps; the loss is a distance rather than its square, of the centre of mass and the orientation together, so that a
-few objects that topple do not outweigh all that slide; half of all is reflected. As in the paper, the loss runs over
-three actions, with gradients through all of them, but only at the end: most of the training is on single substeps from
-true states, which cost a fraction.
+Deviations from the paper (section 4.3), measured in docs/notes/dynamics.md:
+
+- An action is predicted in four substeps.
+- The loss is a distance of centre of mass and orientation together, and not its square, so that a few toppling objects
+  do not outweigh all that slide.
+- Half of the samples are reflected.
+- Most of the training is on single substeps from true states, which cost a fraction. Only at its end does the loss run
+  over three actions with gradients through all of them, as in the paper.
 """
 
 from __future__ import annotations
@@ -60,7 +63,7 @@ from osfcore.io.output_paths import check_weights_place
 from osfcore.io.push_file import Disturbed, PushEpisode, read_sound_pushes
 from osfcore.progress import Progress
 
-# What training never sees, so that there is something left to measure on.
+# Objects and episodes that are held out of training, for measurements.
 
 
 _PAIRS_ONE_IN = 16
@@ -79,7 +82,7 @@ def has_held_out_pair(names: Iterable[str]) -> bool:
 
 
 def is_for_validation(number: int) -> bool:
-    """Return whether training stops by the episode of that number rather than learning from it."""
+    """Return whether the episode of this number is held out to decide when training stops."""
     return number % _EPISODES_ONE_IN == 0
 
 
@@ -99,16 +102,16 @@ class Optimizers:
     """A network in training, and the exponential moving average of its weights.
 
     Attributes:
-        network: with its current weights.
-        average: with weights averaged over a few hundred steps, which validates better.
+        network: the network with its current weights.
+        average: the network with weights averaged over a few hundred steps, which has smaller errors.
     """
 
     def __init__(self, network: PropagationNetwork, rate: float) -> None:
-        """Begin with a network as it is.
+        """Start with a network.
 
         Args:
-            network: to train.
-            rate: of learning, at its highest.
+            network: network to train.
+            rate: highest learning rate.
         """
         self.network, self.average = network, copy.deepcopy(network)
         is_inner = [p.ndim == 2 and p is not network.decoder[-1].weight for p in network.parameters()]
@@ -124,9 +127,9 @@ class Optimizers:
         """Make one step.
 
         Args:
-            loss: to minimise.
-            share: of the highest rate.
-            done: steps before this one; at the beginning the average forgets faster.
+            loss: loss to minimise.
+            share: share of the highest learning rate.
+            done: number of earlier steps. At the beginning, the average forgets faster.
         """
         for optimiser, rate in zip(self._optimisers, self._rates, strict=True):
             optimiser.zero_grad(set_to_none=True)
@@ -157,7 +160,7 @@ class Optimizers:
             optimiser.load_state_dict(kept)
 
 
-# Pieces of recorded pushes as tensors: what training and evaluation roll out and compare with.
+# Parts of recorded pushes as tensors, which training and evaluation roll out and compare with.
 
 
 _MOVED_M = 1e-3
@@ -170,12 +173,12 @@ class Recording:
     Attributes:
         number: shape of each object.
         centre: centres of mass before the first substep and after each one [m].
-        quaternion: orientations, likewise.
-        pusher: its centre, likewise [m].
-        velocity: commanded in each action [m/s].
+        quaternion: orientations at the same instants.
+        pusher: centre of the pusher at the same instants [m].
+        velocity: commanded velocity in each action [m/s].
         starts: episode and action at which windows of `length` actions may start.
         is_busy: whether something moves or is touched in such a window.
-        length: of the windows [actions].
+        length: length of the windows [actions].
     """
 
     number: Int[Tensor, "E N"]
@@ -189,7 +192,7 @@ class Recording:
 
     @property
     def eventful(self) -> Int[np.ndarray, "chosen"]:
-        """Numbers of the windows in which something happens; of all where nothing ever does."""
+        """Indices of the windows in which something happens; of all windows if nothing ever does."""
         busy = np.flatnonzero(self.is_busy)
         return busy if len(busy) else np.arange(len(self.starts))
 
@@ -198,9 +201,9 @@ def record(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape], l
     """Return episodes as tensors, with the windows that can be learned from.
 
     Args:
-        episodes: recorded with poses within their actions.
-        shapes: of all objects in them, by name; numbered by sorted names.
-        length: of the windows [actions].
+        episodes: episodes with poses within their actions.
+        shapes: shapes of all their objects, by name. Shapes are numbered by sorted names.
+        length: length of the windows [actions].
 
     Raises:
         InvalidInput: if the episodes were recorded without substeps, differ in length or number of objects, or hold no
@@ -249,10 +252,10 @@ class Batch(NamedTuple):
 
     Attributes:
         number: shape of each object.
-        motion: at their start.
-        velocity: commanded in each action [m/s].
+        motion: motion at the start of each window.
+        velocity: commanded velocity in each action [m/s].
         centre: true centres of mass after each substep [m].
-        quaternion: true orientations, likewise.
+        quaternion: true orientations after each substep.
     """
 
     number: Int[Tensor, "B N"]
@@ -274,12 +277,12 @@ def batch(
     Velocities at their starts are those of the substep before.
 
     Args:
-        recording: that holds them.
+        recording: recording with the windows.
         table: shapes, on `device`.
-        windows: numbers in `recording.starts`.
-        device: of the tensors.
-        coarse: windows that start with means over the action before instead, all that a rollout from observed states
-            knows; by default none.
+        windows: indices in `recording.starts`.
+        device: device of the tensors.
+        coarse: windows whose initial velocities are means over the action before, as in a rollout from observed states;
+            none by default.
     """
     episode, start = (torch.as_tensor(column) for column in recording.starts[windows].T)
     first = start * SUBSTEPS
@@ -308,8 +311,8 @@ def turn_between(first: Tensor, second: Tensor) -> Tensor:
 # Single substeps of recorded pushes as graphs, ready for the network: features are computed once, not in every
 # step.
 #
-# The true state goes in, the true motion is the target: no errors add up, but a step of training costs a fraction
-# of one over whole windows.
+# The input is the true state, and the target the true motion. Errors do not add up, but a step of training costs a
+# fraction of one over whole windows.
 
 
 _CHUNK = 4096  # scenes per batch
@@ -339,11 +342,11 @@ class Substeps(NamedTuple):
 
     Attributes:
         number: shape of each object.
-        motion: before.
-        velocity: commanded [m/s].
-        shift: of the pusher [m].
-        centre: centres of mass, after [m].
-        quaternion: orientations, after.
+        motion: motion before the substep.
+        velocity: commanded velocity [m/s].
+        shift: shift of the pusher [m].
+        centre: centres of mass after the substep [m].
+        quaternion: orientations after the substep.
     """
 
     number: Int[Tensor, "B N"]
@@ -360,8 +363,8 @@ class _Rows:
 
     Attributes:
         values: the rows.
-        first: of each graph.
-        count: of each graph.
+        first: index of the first row of each graph.
+        count: number of rows of each graph.
     """
 
     values: Tensor
@@ -394,7 +397,7 @@ class Samples:
         return len(self.nodes.count)
 
     def draw(self, graphs: Int[Tensor, "B"], flipped: Bool[Tensor, "B"]) -> Sample:
-        """Return some graphs, those with a flag reflected."""
+        """Return some graphs; those with a flag are reflected."""
         count = self.nodes.count[graphs]
         first = count.cumsum(0) - count
         nodes, pushed, paired = (rows.take(graphs) for rows in (self.nodes, self.pushed, self.paired))
@@ -418,9 +421,9 @@ def samples(
     """Return every substep in which something can move, on the device.
 
     Args:
-        recording: in windows of one action.
+        recording: recording in windows of one action.
         table: shapes of the objects.
-        device: that computes.
+        device: PyTorch device.
         others: further substeps, such as disturbed states.
 
     Raises:
@@ -453,7 +456,7 @@ def _graph_and_target(
 
 
 def _recorded(recording: Recording) -> Iterator[Substeps]:
-    """Yield the substeps of a recording as they truly are and move."""
+    """Yield the substeps of a recording with their true states and motions."""
     starts = torch.as_tensor(recording.starts).repeat_interleave(SUBSTEPS, dim=0)
     steps = starts[:, 1] * SUBSTEPS + torch.arange(SUBSTEPS).repeat(len(recording.starts))
     for e, s in zip(starts[:, 0].split(_CHUNK), steps.split(_CHUNK), strict=True):
@@ -468,7 +471,7 @@ def _recorded(recording: Recording) -> Iterator[Substeps]:
 
 
 def disturbed_substeps(episodes: Sequence[PushEpisode], shapes: Mapping[str, ObjectShape]) -> Iterator[Substeps]:
-    """Yield what is recorded of disturbed states of episodes with the same number of objects."""
+    """Yield the recorded substeps from disturbed states of episodes with the same number of objects."""
     order = {name: number for number, name in enumerate(sorted(shapes))}
     disturbed = [(e, e.disturbed) for e in episodes if e.disturbed is not None and len(e.disturbed.step)]
     for first in range(0, len(disturbed), _TOGETHER):
@@ -496,7 +499,7 @@ def _disturbed(
 def _substeps(
     number: Tensor, start: tuple[Tensor, ...], velocity: Tensor, shift: Tensor, centre: Tensor, quaternion: Tensor
 ) -> Substeps:
-    motion = Motion(*start, floor=torch.zeros(number.shape))  # the floor plays no part: nothing is moved here
+    motion = Motion(*start, floor=torch.zeros(number.shape))  # the floor is not used: nothing is moved here
     return Substeps(number, sleeping(motion), velocity, shift, centre, quaternion)
 
 
@@ -533,12 +536,12 @@ class Validation:
     """Errors on held-out windows of four actions, of objects that truly moved.
 
     Attributes:
-        windows: how many objects in windows truly moved.
+        windows: number of objects in windows that truly moved.
         mm_4: median error of position after four actions [mm].
         deg_4: median error of orientation [deg].
         mean_mm_4: mean error of position [mm].
-        loss: mean distance over all substeps [mm]; training keeps the weights with the least.
-        constant_mm_4: median distance these objects travel, the error of predicting no motion [mm].
+        loss: mean distance over all substeps [mm]. Training keeps the weights with the least loss.
+        constant_mm_4: median distance that these objects travel, which is the error of predicting no motion [mm].
     """
 
     windows: int
@@ -550,12 +553,12 @@ class Validation:
 
 
 def distance(motion: Motion, pieces: Batch, step: int) -> Tensor:
-    """Return how far every object is from the truth after a substep (B, N) [m], its orientation included.
+    """Return the distance of every object from the truth after a substep, including its orientation (B, N) [m].
 
     Args:
-        motion: predicted.
-        pieces: the windows, with the truth.
-        step: which substep, from 0.
+        motion: predicted motion.
+        pieces: the windows with the truth.
+        step: index of the substep, from 0.
     """
     shift = motion.centre - pieces.centre[step]
     turn = 2 * _sine(motion.quaternion, pieces.quaternion[step])
@@ -572,13 +575,13 @@ def _sine(a: Tensor, b: Tensor) -> Tensor:
 def validate(
     network: PropagationNetwork, table: ShapeTable, recording: Recording, device: torch.device | str = "cpu"
 ) -> Validation:
-    """Return errors on windows in which something happens, or on all where nothing ever does.
+    """Return errors on windows in which something happens, or on all windows if nothing ever does.
 
     Args:
-        network: to measure.
+        network: network to measure.
         table: shapes of the recorded objects, on `device`.
-        recording: held out, with one or more windows of four actions; of the busy ones 2000 at most are measured.
-        device: that computes.
+        recording: held-out recording with windows of four actions. At most 2000 windows are measured.
+        device: PyTorch device.
     """
     chosen = np.random.default_rng(0).permutation(recording.eventful)[:_MEASURED]
     pieces = batch(recording, table, chosen, device)
@@ -596,7 +599,7 @@ def validate(
     return Validation(len(error), medians[0], medians[1], float(error.mean()), loss, medians[2])
 
 
-# A training run on push files, with our model or the paper's: a killed one goes on, and the best weights are kept.
+# A training run on push files, of our model or the paper's. A killed run can continue, and the best weights are kept.
 
 
 UNROLLED = 3  # actions of a window (paper: up to three future steps)
@@ -607,21 +610,21 @@ _OWN_METRICS = ("validation_mm_4", "validation_windows")
 
 
 class PushTraining(ABC):
-    """A network that learns from push files; subclasses say how.
+    """A training run on push files. Subclasses define the steps.
 
     Args:
-        network: with the weights to begin with.
-        parts: networks and optimisers by the names they have in a checkpoint.
+        network: network with its initial weights.
+        parts: networks and optimisers, by their names in a checkpoint.
         fingerprint: settings and data, which a checkpoint must agree with.
         out: file to write.
         total: iterations.
         patience: measurements without a better one after which training stops.
-        seed: of what is drawn.
+        seed: seed of everything random.
 
     Attributes:
         best: the best measurement on held-out episodes; None before the first.
-        done: iterations that are over.
-        fruitless: measurements since the best one.
+        done: number of finished iterations.
+        fruitless: number of measurements since the best one.
     """
 
     measurement: type[Any]  # with at least `mm_4` and `deg_4`
@@ -648,21 +651,21 @@ class PushTraining(ABC):
 
     @abstractmethod
     def measured(self) -> tuple[Any, nn.Module]:
-        """Return the errors on held-out episodes, and the network that has them."""
+        """Return the errors on held-out episodes, and the measured network."""
 
     @abstractmethod
     def described(self) -> tuple[bytes, dict[str, Any]]:
-        """Return the file of the network, and what else than its errors is known of it."""
+        """Return the contents of the network's file, and its metrics besides the errors."""
 
     @property
     def note(self) -> str:
-        """The best errors so far, for a person."""
+        """The best errors so far, for people."""
         if self.best is None:
             return "not measured yet"
         return f"held out: {self.best.mm_4:.1f} mm, {self.best.deg_4:.1f} deg after 4 steps"
 
     def run(self) -> Iterator[Progress]:
-        """Descend, from the checkpoint of a killed run if there is one, and write the best weights."""
+        """Train, from the checkpoint of a killed run if there is one, and write the best weights."""
         checkpoint = self._out.with_suffix(".checkpoint")
         resume_from(checkpoint, self._fingerprint, self._resume)
         while self.done < self.total and self.fruitless < self._patience:
@@ -710,17 +713,17 @@ class PushTraining(ABC):
 
 
 def share_of_rate(done: int, total: int, highest: float = 1) -> float:
-    """Return the rate of learning after a warm-up and along a cosine, as a share of `highest`."""
+    """Return the learning rate after a warm-up and along a cosine, as a share of `highest`."""
     falling = _LAST_RATE + (1 - _LAST_RATE) * (1 + math.cos(math.pi * done / total)) / 2
     return highest * min(1, (done + 1) / _WARM_UP) * falling
 
 
 def prepare(config: Any, *more: tuple[str, float, float, float]) -> torch.device:  # noqa: ANN401
-    """Check settings such as `TrainDynamics` and the place to write to, and return the device that computes.
+    """Check settings such as `TrainDynamics` and the output, and return the PyTorch device.
 
     Args:
         config: the settings.
-        more: further ones, as for `check_ranges`.
+        more: further ranges, as for `check_ranges`.
 
     Raises:
         InvalidInput: if a number is out of range or the device is not there.
@@ -741,7 +744,7 @@ def prepare(config: Any, *more: tuple[str, float, float, float]) -> torch.device
 
 
 def command_of(config: Any, options: Sequence[str], *method: str) -> list[str]:  # noqa: ANN401
-    """Return the words of the command that trains with such settings; options that have their default are left out."""
+    """Return the words of the command that trains with these settings, without options that have their defaults."""
     words = ["osf", "train", "dynamics", *method, "--data", *(path.name for path in config.data)]
     words += ["--out", config.out.name]
     default = type(config)(config.data, config.out)
@@ -752,20 +755,20 @@ def command_of(config: Any, options: Sequence[str], *method: str) -> list[str]: 
 
 
 def fingerprint_of(config: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return what a checkpoint must agree with of settings such as `TrainDynamics`."""
+    """Return the settings, such as of `TrainDynamics`, that a checkpoint must agree with."""
     return {**asdict(config), "data": [path.name for path in config.data], "out": "", "device": ""}
 
 
 def split_episodes(
     data: Sequence[Path], known: Collection[str], is_wanted: Callable[[tuple[str, ...]], bool], advice: str
 ) -> tuple[list[PushEpisode], list[PushEpisode]]:
-    """Return the episodes to learn from, and those to stop by.
+    """Return the episodes to learn from, and the held-out ones that decide when to stop.
 
     Args:
         data: push files.
-        known: objects; episodes with others are left out.
-        is_wanted: by the names of its objects, whether an episode is taken.
-        advice: what to do where nothing is left, for the error.
+        known: names of known objects. Episodes with other objects are left out.
+        is_wanted: function from the names of its objects to whether an episode is used.
+        advice: what to do if no episode is left, for the error.
 
     Raises:
         InvalidInput: if no episode is left in either part.
@@ -802,16 +805,16 @@ class TrainDynamics:
     Attributes:
         data: push files; one in twelve episodes is held out.
         out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
-        iterations: on single substeps, at most.
-        batch: substeps in each.
-        long_iterations: on windows of three actions, after these.
-        long_batch: windows in each.
+        iterations: largest number of iterations on single substeps.
+        batch: substeps in each of these iterations.
+        long_iterations: number of further iterations, on windows of three actions.
+        long_batch: windows in each of these iterations.
         hidden: width of the network.
-        rate: of learning, at its highest; on windows a tenth of it; of what is no matrix half of it.
-        patience: measurements on held-out episodes without a better one after which training stops.
+        rate: highest learning rate; on windows a tenth of it, and for parameters that are no matrices half of it.
+        patience: number of measurements without improvement after which training stops.
         without: objects whose episodes are left out.
         device: "auto", "cpu" or "cuda".
-        seed: of everything random.
+        seed: seed of everything random.
     """
 
     data: tuple[Path, ...]
@@ -839,7 +842,7 @@ def train_dynamics(config: TrainDynamics, shapes: Mapping[str, ObjectShape]) -> 
 
     Args:
         config: what to train on.
-        shapes: of all objects with a field; episodes with other objects are left out.
+        shapes: shapes of all objects with a field; episodes with other objects are left out.
 
     Raises:
         InvalidInput: if a number is out of range, the device is not there, or nothing is left to learn from.
@@ -922,7 +925,7 @@ class _Run(PushTraining):
 
     def measure(self) -> None:
         super().measure()
-        if self.fruitless >= self._config.patience:  # what is left of this part would be in vain
+        if self.fruitless >= self._config.patience:  # the rest of this part would gain nothing
             self.done = self._config.iterations if self.done < self._config.iterations else self.total
             self.fruitless = 0
 

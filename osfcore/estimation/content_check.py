@@ -1,9 +1,13 @@
-"""Whether a photo shows some objects at all: a quick check before a goal image is estimated, and before any episode.
+"""A quick check that a photo shows certain objects, before a goal image is estimated and before any episode.
 
-Two independent cues, neither of which needs exact poses. Colour indexing (Swain and Ballard, 1991) compares the
-chromaticities of what is no table with those of the objects' fields: matte shading under a white light does not change
-them. Template matching puts the objects where they explain the photo best, and measures how much worse the best one's
-absence would make it. A logistic regression joins both; see `_EVIDENCE`.
+It uses two independent cues that need no exact poses:
+
+- Colour indexing (Swain and Ballard, 1991) compares the chromaticities of pixels beside the table with those of the
+  objects' fields. Matte shading under a white light does not change chromaticities.
+- Template matching puts the objects where they explain the photo best. It measures how much the loss grows without the
+  object that fits best.
+
+A logistic regression combines both cues; see `_EVIDENCE`.
 """
 
 from __future__ import annotations
@@ -39,10 +43,10 @@ _SHOWN, _OTHERS = 0.0, -1.5  # log odds
 
 
 class ContentChecker:
-    """Checks photos for the objects of one set of models; keeps their palettes.
+    """Checks photos for the objects of one set of models. It stores their palettes.
 
     Args:
-        models: fields of the objects and the table.
+        models: models of the objects and the table.
     """
 
     def __init__(self, models: ObjectModels) -> None:
@@ -50,11 +54,11 @@ class ContentChecker:
         self._palettes: dict[str, Float32[np.ndarray, "b b"]] = {}
 
     def check(self, observation: Observation, prior: SceneState) -> ContentCheck:
-        """Look whether objects are in a photo, in a second or two.
+        """Check whether objects are in a photo. This takes a second or two.
 
         Args:
             observation: one view without the pusher.
-            prior: how the objects lie now; where they lie plays no part.
+            prior: present state of the scene. Only the orientations matter, not the positions.
 
         Raises:
             UnknownName: if an object has no field.
@@ -89,7 +93,7 @@ class ContentChecker:
         return float(found * (seen * union).sum())
 
     def _palette(self, name: str) -> Float32[np.ndarray, "b b"]:
-        """Chromaticities of an object from all sides, under one light."""
+        """Return the chromaticities of an object from all sides, under one light."""
         if name not in self._palettes:
             resting = self._models.resting(name)
             chosen = np.linspace(0, len(resting.heights) - 1, _VIEWS_OF_PALETTE).astype(int)
@@ -120,7 +124,7 @@ class ContentChecker:
 
 
 def _chromaticities(pixels: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "b b"]:
-    """Histogram of red and green over the sum of all colours; it sums to 1, or to 0 if there are no pixels."""
+    """Return a histogram of red and green as shares of all colours. It sums to 1, or to 0 without pixels."""
     shares = pixels / (pixels.sum(axis=-1, keepdims=True) + _DARK)
     edges = np.linspace(0, _MOST_CHROMA, _BINS + 1)
     counts = np.histogram2d(shares[:, 0], shares[:, 1], bins=(edges, edges))[0]

@@ -1,19 +1,25 @@
 """The first frame: all poses and the light from images with masks (paper section 4.2).
 
-In the paper's order: the light is held overhead and each object's pose is optimised by CMA-ES within its own masks
-(eq. 5); then CMA-ES optimises all poses and the light over whole images (eq. 6). Deviations: the first part starts from
-every resting orientation of an object rather than from one guess, since the loss has many local minima over
-orientations; a grid search of the hemisphere initialises the light; Gauss-Newton refines what CMA-ES finds.
+The method follows the paper:
 
-Pictures may differ from those that fields were made for in exposure, encoding, ambient light and the table's colour.
-Where the table looks as it is known (`check_table`), the method above does everything. Where no shadow decides, it
-is asked first, and its answer taken if the loss at its end is low or the image model at its poses the usual one: under
-a high lamp and beside one object exposure, ambient light and table explain each other. Otherwise an image model is
-fitted first (`Calibrator`), with each object in the pose that fits its masks best at any brightness, once for linear
-pictures and once for sRGB ones. What leaves less unexplained is tried first; the other one too if the loss at its end
-is high or the estimate doubted: then the lower loss decides. Pictures and fields are made to agree, and the usual
-method finds poses and lamp. From these the image model is searched for once more, and refined in turn with poses and
-lamp (Gauss-Newton) until the lamp stands still.
+1. The light is held overhead, and CMA-ES optimises each object's pose within its own masks (eq. 5).
+2. CMA-ES optimises all poses and the light over whole images (eq. 6).
+
+Deviations: step 1 starts from every resting orientation of an object and not from one guess, since the loss has many
+local minima over orientations. A grid search over the hemisphere initialises the light. Gauss-Newton refines the result
+of CMA-ES.
+
+Images may differ from those that the fields were trained for in exposure, encoding, ambient light and table colour.
+`check_table` decides what to do:
+
+- "usual": the table looks as expected. The method above does everything.
+- "unclear": no full shadow is visible, so that the lamp and the exposure cannot be separated. The method above runs
+  first. Its estimate is kept if its loss is low, or if the image model fitted at its poses is the usual one.
+  Otherwise, the next case applies.
+- "other": an image model is fitted first (`Calibrator`), with each object in the pose that fits its masks best at any
+  brightness. This is done for linear and for sRGB values. The method above then runs on the adapted images and fields,
+  first with the encoding that leaves less unexplained. The other encoding is tried if the loss is high or the estimate
+  doubtful; the lower loss decides. Finally image model, poses and lamp are refined in turn until the lamp stays still.
 """
 
 from __future__ import annotations
@@ -73,19 +79,19 @@ _SETTLED = 2e-4  # photometric loss; pictures decoded wrongly ended at 3e-4 and 
 
 @dataclass(frozen=True, slots=True)
 class FirstFrameConfig:
-    """How much work a first estimate is.
+    """Settings of `estimate_first`.
 
     Attributes:
-        starts: orientations of each object that CMA refines.
-        population: of CMA-ES for one object and start, by the masked loss (eq. 5).
-        generations: likewise.
-        joint_population: of CMA-ES for the whole scene, by the photometric loss (eq. 6).
-        joint_generations: likewise.
-        coarse_iterations: of Gauss-Newton at half the resolution.
-        fine_iterations: at full resolution.
-        light: "search" for a search of the hemisphere before CMA, "cma" for CMA alone from overhead as in the paper.
-        held_light: unit vector toward a light that is not estimated, to measure what knowing it is worth; None to
-            estimate it.
+        starts: orientations of each object that CMA-ES refines.
+        population: population of CMA-ES for one object and start, by the masked loss (eq. 5).
+        generations: its generations.
+        joint_population: population of CMA-ES for the whole scene, by the photometric loss (eq. 6).
+        joint_generations: its generations.
+        coarse_iterations: iterations of Gauss-Newton at half the resolution.
+        fine_iterations: iterations of Gauss-Newton at full resolution.
+        light: "search" to search the hemisphere before CMA-ES, "cma" for CMA-ES alone, starting from a light overhead
+            as in the paper.
+        held_light: unit vector toward a known light, which is then not estimated; None to estimate the light.
     """
 
     starts: int = 3
@@ -102,17 +108,28 @@ class FirstFrameConfig:
 def estimate_first(
     models: ObjectModels, observation: Observation, rng: np.random.Generator, config: FirstFrameConfig | None = None
 ) -> Iterator[EstimateStep]:
-    """Find all poses and the light; the last step holds the estimate, and the image model of unusual pictures.
+    """Estimate the poses of all objects and the light from images with masks, without an initial guess.
 
     Args:
-        models: fields of the objects and the table.
-        observation: one or more views with masks, of any exposure, linear or sRGB.
-        rng: of the searches.
-        config: how much work to do; under a held light pictures are taken for usual ones.
+        models: models of the objects and the table.
+        observation: one or more views with masks. Any exposure works, and both linear and sRGB values.
+        rng: random generator of the searches.
+        config: settings. With `held_light`, the exposure is assumed to be the usual one.
+
+    Returns:
+        Steps of the search. The last one has `estimate`, and `image_model` if the exposure is not the usual one.
 
     Raises:
-        InvalidInput: without masks, or if an object's masks are all empty.
+        InvalidInput: if there are no masks, or all masks of an object are empty.
         UnknownName: if an object has no field.
+
+    Example:
+        >>> from osfcore.estimation.first_frame import FirstFrameConfig
+        >>> quick = FirstFrameConfig(starts=1, fine_iterations=1)
+        >>> *_, last = estimate_first(models, observation, np.random.default_rng(0), quick)
+        >>> error = last.estimate.state.pose(name).position - state.pose(name).position
+        >>> bool(np.linalg.norm(error) < 0.002)  # [m]
+        True
     """
     config = config or FirstFrameConfig()
     models.check(observation.names)
@@ -152,9 +169,9 @@ def estimate_first(
 def estimate_first_calibrated(
     models: ObjectModels, observation: Observation, rng: np.random.Generator, config: FirstFrameConfig | None = None
 ) -> Iterator[EstimateStep]:
-    """Find all poses and the light in pictures of the exposure, ambient light and table that fields were made for.
+    """Estimate all poses and the light in images like those that the fields were trained for.
 
-    Arguments, steps and errors are those of `estimate_first`.
+    Arguments, steps and errors are the same as for `estimate_first`.
     """
     models.check(observation.names)
     _check_masks(observation)
@@ -162,10 +179,10 @@ def estimate_first_calibrated(
 
 
 def _check_masks(observation: Observation) -> None:
-    """Refuse an observation that does not show where each object is.
+    """Check that an observation has a mask of each object.
 
     Raises:
-        InvalidInput: without masks, or if an object's masks are all empty.
+        InvalidInput: if there are no masks, or all masks of an object are empty.
     """
     if observation.masks is None:
         raise InvalidInput("masks of the first frame", "missing", "given: one per camera and object")
@@ -199,7 +216,7 @@ class _FirstFrameEstimator:
         starts: list[RankedPoses] = []
         for name, part in zip(self._names, parts, strict=True):
             starts.append(initial_poses(self._models, name, part))
-            yield self._ranking_step("orientations", f"{name}: how it may lie", starts, OVERHEAD)
+            yield self._ranking_step("orientations", f"{name}: possible orientations", starts, OVERHEAD)
         light = self._held
         if light is None and self._config.light == "search":
             light = search_light(self._models, self._rough, self._coarse, self._initial_guess(starts, OVERHEAD))
@@ -228,7 +245,7 @@ class _FirstFrameEstimator:
     def _search_each(
         self, parts: list[ObjectView], starts: list[RankedPoses], light: np.ndarray
     ) -> Iterator[EstimateStep]:  # returns the refined starts
-        """Search each object's pose from its starts by CMA-ES on the masked loss (eq. 5), the light held."""
+        """Search each object's pose from its starts by CMA-ES on the masked loss (eq. 5), with the light held."""
         population, brightness = self._config.population, self._held is None and self._config.light == "cma"
         searches = [
             MultistartCMA(
@@ -271,24 +288,24 @@ class _FirstFrameEstimator:
         rounds = (self._middle, config.coarse_iterations), (self._fine, config.fine_iterations)
         for views, iterations in rounds:
             sweeps = gauss_newton(self._models, views, at, iterations=iterations, light=light)
-            at = yield from self._reporter.refinements("The last millimetres", at, sweeps)
+            at = yield from self._reporter.refinements("Refining all poses", at, sweeps)
         return at
 
     def _compare_orientations(
         self, at: GaussNewtonState, starts: list[RankedPoses]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Replace each object's orientation by any hypothesis under which the whole images fit better."""
+        """Replace each object's orientation by a hypothesis with which the whole images fit better, if there is one."""
         for n, found in enumerate(starts):
             turned = (find(self._models, at.params, n) for find in (yaw_hypotheses, side_hypotheses))
             others = Pose.joined(found.poses, *turned)
             at, self._rivals[n] = compare_orientations(
                 self._models, self._coarse, self._middle, self._fine, at, n, others
             )
-            yield self._reporter.refinement(f"{self._names[n]}: the other way round", at)
+            yield self._reporter.refinement(f"{self._names[n]}: turned around", at)
         return at
 
     def _initial_guess(self, starts: list[RankedPoses], light: np.ndarray) -> SceneParameters:
-        """The best of each object's poses; objects without any yet are put far below the table, out of view."""
+        """Return the best pose of each object. Objects without a pose yet are put far below the table, out of view."""
         best = [found.poses[0] for found in starts]
         poses = Pose.stacked(best + [OUT_OF_VIEW] * (len(self._names) - len(best)))
         return SceneParameters(self._names, poses.position, poses.quaternion, light, self._pusher)
@@ -300,7 +317,7 @@ class _FirstFrameEstimator:
 
 
 def _visible_part(views: ObservedViews, number: int) -> ObjectView:
-    """Cut out an object; where its masks are too thin for this resolution, their brightest pixel stands for them."""
+    """Crop the images to an object. A mask too thin for this resolution is replaced by its strongest pixel."""
     assert views.masks is not None
     own = views.masks[:, number]
     if own.max() > 0.5:
@@ -310,17 +327,17 @@ def _visible_part(views: ObservedViews, number: int) -> ObjectView:
     return crop_to_masks(replace(views, masks=masks), number)
 
 
-# Pictures of unknown exposure, encoding, ambient light and table.
+# Images of unknown exposure, encoding, ambient light and table.
 
 
 def _is_settled(last: EstimateStep) -> bool:
-    """Decide whether nothing speaks for another image model."""
+    """Return whether an estimate needs no other image model."""
     return last.loss < _SETTLED and last.estimate is not None and last.estimate.trusted
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Calibrated:
-    """Pictures as a camera response makes them linear, and the image model that explains them."""
+    """Images decoded with one encoding, and the image model fitted to them."""
 
     encoding: Encoding
     observation: Observation
@@ -337,7 +354,7 @@ class _Calibrated:
 
 
 def _rough_poses(models: ObjectModels, observation: Observation) -> SceneParameters:
-    """Find the pose of each object that fits its masks best, at any brightness."""
+    """Return the pose of each object that fits its masks best, at any brightness."""
     coarse = views_of(observation, _COARSE_SIDE)
     parts = ((name, _visible_part(coarse, n)) for n, name in enumerate(observation.names))
     best = Pose.stacked(initial_poses(models, name, part).poses[0] for name, part in parts)
@@ -347,7 +364,7 @@ def _rough_poses(models: ObjectModels, observation: Observation) -> SceneParamet
 def _calibrated(
     calibrator: Calibrator, observation: Observation, params: SceneParameters, encoding: Encoding
 ) -> _Calibrated:
-    """Fit the image model of pictures in an encoding to rough poses."""
+    """Fit an image model to images of this encoding, at rough poses."""
     images = linear_from_encoded(observation.images, encoding).astype(np.float32)
     linear = replace(observation, images=images)
     found = calibrator.search(views_of(linear, _ROUGH_SIDE), views_of(linear, _COARSE_SIDE), params)
@@ -357,7 +374,7 @@ def _calibrated(
 def _estimate_with(
     models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, rng: np.random.Generator, config: FirstFrameConfig
 ) -> Iterator[EstimateStep]:
-    """Run the usual method on pictures and models that agree, then refine both."""
+    """Run the usual method on adapted images and models, then refine the image model and the poses."""
     model, linear, more = rough.found.model, rough.observation, (_ROUNDS + 1) * _ITERATIONS
     usual = estimate_first_calibrated(adapted(models, linear.names, model), model.normalized(linear), rng, config)
     before = next(usual)
@@ -374,9 +391,9 @@ def _estimate_with(
 def _refine_with_image_model(
     models: ObjectModels, calibrator: Calibrator, rough: _Calibrated, estimate: EstimatedState, reporter: StepReporter
 ) -> Iterator[EstimateStep]:
-    """Fit image model, poses and lamp in turn, until the lamp stands still.
+    """Fit image model, poses and lamp in turn until the lamp stays still.
 
-    The image model is searched for once more first: the one that rough poses have led to may be far off.
+    The image model is first searched again, since the one from rough poses may be far off.
     """
     linear = rough.observation
     at = GaussNewtonState.at(SceneParameters.of(estimate.state, linear.pusher))
@@ -401,7 +418,7 @@ def _refine_with_image_model(
 def _refine_poses_and_lamp(
     models: ObjectModels, linear: Observation, found: Calibration, at: GaussNewtonState, reporter: StepReporter
 ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-    """Refine poses and lamp by Gauss-Newton, with models and pictures made to agree by a calibration."""
+    """Refine poses and lamp by Gauss-Newton, with models and images adapted by a calibration."""
     fitting, normal = adapted(models, linear.names, found.model), found.model.normalized(linear)
     sharp, soft = (views_of(normal, side, samples=2) for side in (FINE_SIDE, _COARSE_SIDE))
     at = GaussNewtonState.at(replace(at.params, light=found.light))

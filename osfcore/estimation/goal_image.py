@@ -1,10 +1,11 @@
-"""Goal images: one view, no masks, objects known by name, perhaps under another light than the scene.
+"""Estimates from goal images: one view without masks, of objects known by name, perhaps under another light.
 
-First the scene as it is now is compared with the image: objects that it shows there stay, and templates of the others
-are matched over the image, in the resting orientation that they have now, since goals are mostly reached by pushing.
-Where that leaves doubts, templates of all objects are matched, combinations of matches are ranked by their photometric
-loss under any light, and what is still doubted is matched in other orientations (all in `hypotheses.py`).
-Gauss-Newton refines as in the first frame.
+1. The present scene is compared with the image. Objects that the image shows at their present poses stay.
+2. Templates of the other objects are matched over the image, in their present resting orientations, since goals are
+   mostly reached by pushing.
+3. If doubts remain, templates of all objects are matched. Combinations of matches are ranked by their photometric loss
+   under any light. Objects that are still doubtful are matched in other orientations (all in `hypotheses.py`).
+4. Gauss-Newton refines the poses as in the first frame.
 """
 
 from __future__ import annotations
@@ -52,14 +53,14 @@ _BESIDE_M = 0.04
 
 @dataclass(frozen=True, slots=True)
 class GoalImageConfig:
-    """How much work a goal estimate is.
+    """Settings of `estimate_goal`.
 
     Attributes:
-        side: of the image that templates are slid over [px].
-        planar_iterations: of Gauss-Newton over position and yaw.
-        free_iterations: of Gauss-Newton over whole poses.
-        widen_all: match every object again in all resting orientations, also where none is doubted.
-        held_light: unit vector toward a light that is not estimated; None to estimate it.
+        side: longest side of the image that templates are matched in [px].
+        planar_iterations: iterations of Gauss-Newton over position and yaw.
+        free_iterations: iterations of Gauss-Newton over whole poses.
+        widen_all: whether to match every object in all its resting orientations, and not only doubtful ones.
+        held_light: unit vector toward a known light, which is then not estimated; None to estimate the light.
     """
 
     side: int = FINE_SIDE
@@ -76,18 +77,31 @@ def estimate_goal(
     config: GoalImageConfig | None = None,
     shares: Mapping[str, float] | None = None,
 ) -> Iterator[EstimateStep]:
-    """Find poses and light of a goal image; the last step holds the estimate.
+    """Estimate the poses and the light that one goal image shows.
 
     Args:
-        models: fields of the objects and the table.
-        observation: one view without the pusher; masks play no part.
-        prior: the scene now, or any other guess: how objects lie matters most; places and light save time if right.
-        config: how much work to do.
-        shares: by object, its residual in the scene now as a share of its level, see `goal_allowance`.
+        models: models of the objects and the table.
+        observation: one view without the pusher. Masks are ignored.
+        prior: the present scene, or another guess. The resting orientations in it matter most; right positions and a
+            right light save time.
+        config: settings.
+        shares: for each object, its residual in the present scene as a share of its brightness there, as
+            `osfcore.estimation.uncertainty.relative_residuals` returns it.
+
+    Returns:
+        Steps of the search. The last one has `estimate`.
 
     Raises:
-        InvalidInput: if there is more than one view, or the prior is of other objects.
+        InvalidInput: if there is more than one view, or the prior has other objects.
         UnknownName: if an object has no field.
+
+    Example:
+        >>> image = models.together.render(SceneBatch.of(state), [goal_camera()]).rgb[0, 0]
+        >>> seen = GoalImage(goal_camera(), image).observed(state.names)
+        >>> *_, last = estimate_goal(models, seen, prior=state)
+        >>> error = last.estimate.state.pose(name).position - state.pose(name).position
+        >>> bool(np.linalg.norm(error) < 0.003)  # [m]
+        True
     """
     models.check(observation.names)
     if len(observation.cameras) != 1:
@@ -134,7 +148,7 @@ class _GoalImageEstimator:
         yield self._reporter.finish(at, self._estimate(at, self._rivals))
 
     def _from_prior(self) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Keep what the image shows where the prior has it; match templates of the others alone."""
+        """Keep objects that the image shows at their prior poses; match templates of the others."""
         params = self._relit(self._prior_guess())
         fit = evaluate_fit(self._models, self._fine, params)
         bad = misfits(fit, goal_allowance(fit, self._usual))
@@ -176,14 +190,14 @@ class _GoalImageEstimator:
         return SceneParameters(self._names, poses.position, poses.quaternion, light, None)
 
     def _relit(self, params: SceneParameters) -> SceneParameters:
-        """Put the guess under the light that fits best, if that fits better than its own."""
+        """Return the guess under the best light, if that fits better than its own light."""
         if self._is_held:
             return params
         other = replace(params, light=search_light(self._models, self._rough, self._coarse, params))
         return min(params, other, key=lambda one: loss_of(self._models, self._coarse, one))
 
     def _doubtful_objects(self, at: GaussNewtonState) -> list[int]:
-        """Return numbers of objects whose fit is poor, or whose pose the image does not determine."""
+        """Return the indices of objects that fit poorly, or whose pose the image does not determine."""
         if self._config.widen_all:
             return list(self._everything)
         sure = {n: ratio for n, ratio in self._rivals.items() if ratio >= SURE_RIVAL_RATIO}
@@ -192,16 +206,16 @@ class _GoalImageEstimator:
     def _relocate_doubtful(
         self, at: GaussNewtonState, bad: list[int], matches: list[TemplateMatches]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Match templates of doubted objects again, against the errors of a rendering of the other objects.
+        """Match templates of doubtful objects again, where a rendering of the other objects does not explain the image.
 
-        Under the estimated light the table's brightness is known, so grey objects differ from its shadows.
+        The estimated light gives the brightness of the table, so that grey objects differ from shadows.
         """
         self._reporter.total += len(bad) + 1 + self._most_refinements
         params = without_objects(at.params, bad)
         behind = scene_errors(self._models, self._slide, params)
         for n in bad:
             matches[n] = self._match_prior_orientation(n, behind, params.light)
-            yield self._step("orientations", f"{self._names[n]}: in what is unexplained", at.params, matches)
+            yield self._step("orientations", f"{self._names[n]}: in unexplained parts of the image", at.params, matches)
         for _ in range(_ROUNDS):
             params = reassign_poses(self._models, self._coarse, params, matches)
         yield self._step("together", "Doubted objects seen elsewhere", params, matches)
@@ -211,7 +225,7 @@ class _GoalImageEstimator:
     def _widen_hypotheses(
         self, at: GaussNewtonState, bad: list[int], matches: list[TemplateMatches]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Match templates of doubted objects in all of their resting orientations."""
+        """Match templates of doubtful objects in all their resting orientations."""
         self._reporter.total += len(bad) + self._pass
         behind = scene_errors(self._models, self._coarse, without_objects(at.params, bad))
         for n in bad:
@@ -228,13 +242,13 @@ class _GoalImageEstimator:
     def _accept_if_better(
         self, at: GaussNewtonState, params: SceneParameters, matches: list[TemplateMatches], moved: Sequence[int]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Refine another guess; keep the result if its loss is lower."""
+        """Refine another guess; keep it if its loss is lower."""
         rivals = dict(self._rivals)
         other = yield from self._refined(params, matches, moved)
         return self._better_of(at, other, rivals)
 
     def _better_of(self, at: GaussNewtonState, other: GaussNewtonState, rivals: dict[int, float]) -> GaussNewtonState:
-        """The one whose loss is lower; of two that cost the same the first, with its own rivals."""
+        """Return the guess with the lower loss, together with its rivals; the first one if both are equal."""
         here, there = (loss_of(self._models, self._fine, one.params) for one in (at, other))
         if there < here:
             return other
@@ -247,9 +261,9 @@ class _GoalImageEstimator:
         """Refine positions and yaw on the table, then whole poses, by Gauss-Newton.
 
         Args:
-            params: the guess.
-            matches: of each object; those nearby are compared.
-            moved: numbers of the objects whose places and orientations are in question; the others are only refined.
+            params: guess of the scene.
+            matches: matches of each object. Those near the guess are compared with it.
+            moved: indices of the objects whose positions and orientations are compared. The others are only refined.
         """
         at, note = GaussNewtonState.at(params), "On the table"
         for views, iterations in (self._middle, self._config.planar_iterations), (self._fine, _FINE_PLANAR):
@@ -268,9 +282,9 @@ class _GoalImageEstimator:
     def _compare_orientations(
         self, at: GaussNewtonState, matches: list[TemplateMatches], moved: Sequence[int]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Replace each object's orientation by any hypothesis of lower loss, then refine all six degrees of freedom.
+        """Replace each object's orientation by a hypothesis of lower loss, if there is one; then refine whole poses.
 
-        A wrong orientation also shifts the position, so matches nearby are tried as well.
+        Matches nearby are tried as well, since a wrong orientation also shifts the position.
         """
         for n in moved:
             poses = matches[n].poses
@@ -279,19 +293,19 @@ class _GoalImageEstimator:
             at, self._rivals[n] = compare_orientations(
                 self._models, self._middle, self._fine, self._fine, at, n, others
             )
-            yield self._reporter.refinement(f"{self._names[n]}: the other way round", at)
+            yield self._reporter.refinement(f"{self._names[n]}: turned around", at)
         at, work = at.undamped(), self._config.free_iterations
         sweeps = gauss_newton(
             self._models, self._fine, at, iterations=work, light=self._light_views, until_settled=True
         )
-        return (yield from self._reporter.refinements("The last millimetres", at, sweeps))
+        return (yield from self._reporter.refinements("Refining all poses", at, sweeps))
 
     def _estimate(self, at: GaussNewtonState, rivals: Mapping[int, float]) -> EstimatedState:
-        """Return the estimate with its uncertainty; heights are checked, since one view hardly shows depth.
+        """Return the estimate with its uncertainty. Heights are checked, since one view hardly shows depth.
 
         Args:
             at: where Gauss-Newton ended.
-            rivals: by object, the best loss of a different orientation over the loss of the one chosen.
+            rivals: for each object, ratio of the best loss of a different orientation to the loss of the chosen one.
         """
         fit, poses = evaluate_fit(self._models, self._fine, at.params), at.params.state().poses
         lowest = np.array([self._models.resting(name).lowest(poses[n]) for n, name in enumerate(self._names)])
@@ -311,7 +325,7 @@ class _GoalImageEstimator:
         )
 
     def _initial_guess(self, matches: list[TemplateMatches]) -> SceneParameters:
-        """The best match of each object; objects without one are out of view."""
+        """Return the best match of each object. Objects without a match are put out of view."""
         params = without_objects(self._prior_guess(), self._everything)
         for n, found in enumerate(matches):
             if len(found.scores):
@@ -324,15 +338,15 @@ class _GoalImageEstimator:
         """Find the combination of matches with the lowest photometric loss."""
         for best, loss in SceneAssembly(self._models, self._rough, self._coarse, matches).scenes(params):
             params = best
-            yield self._step("together", "Which matches explain the image together", params, matches, loss=loss)
+            yield self._step("together", "Combining matches", params, matches, loss=loss)
         return params
 
     def _reassign(
         self, at: GaussNewtonState, matches: list[TemplateMatches], moved: Sequence[int]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Move objects to other matches of theirs if that lowers the loss after refinement.
+        """Move objects to other matches if that lowers the loss after refinement.
 
-        Gauss-Newton may have drawn an object into another's shadow or behind it, a local minimum.
+        This leaves local minima, in which Gauss-Newton has moved an object behind another one or into its shadow.
         """
         params = reassign_poses(self._models, self._coarse, at.params, matches)
         here, there = (loss_of(self._models, self._coarse, one) for one in (at.params, params))

@@ -1,4 +1,4 @@
-"""Whether a picture is one of the goal camera, or a photograph of another table: told at once, without any renderer."""
+"""A fast check, without a renderer, whether an image comes from the goal camera or shows another table."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ _SHADED, _LIT = 0.2, 1.05  # light on the table, as a share of that under a lamp
 
 
 def is_goal_view(table: TableField, image: Float32[np.ndarray, "h w 3"], camera: Camera) -> bool:
-    """Whether a picture's border, where objects seldom lie, is the table as a camera sees it; also if it is plain.
+    """Return whether the border of an image shows the table as a camera sees it; also True for a plain image.
+
+    Objects seldom lie at the border.
 
     Args:
-        table: what the objects lie on.
-        image: linear radiance.
-        camera: that may have taken it.
+        table: field of the table.
+        image: linear radiance in [0, 1].
+        camera: camera that may have taken the image.
     """
     scale = min(1.0, _SIDE / max(image.shape[:2]))
     width, height = (max(round(side * scale), 1) for side in (image.shape[1], image.shape[0]))
@@ -43,7 +45,7 @@ def is_goal_view(table: TableField, image: Float32[np.ndarray, "h w 3"], camera:
 
 
 def _bare(table: TableField, camera: Camera, pixels: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 3"]:
-    """The empty table under a lamp overhead, at pixels of a camera above it."""
+    """Return the radiance of the empty table under a lamp overhead, at pixels of a camera above it."""
     rays, origin = camera.ray_directions(pixels), camera.T_world_camera.position
     down = np.maximum(-rays[:, 2:], 1e-9)
     places = (origin + rays * origin[2] / down)[:, :2] / table.half_side  # -1 to 1 on the table

@@ -1,4 +1,4 @@
-"""Hypotheses for what descent does not reach: other orientations, objects found by templates, scenes of both."""
+"""Hypotheses that descent does not reach: other orientations, objects found by templates, and scenes of both."""
 
 from __future__ import annotations
 
@@ -55,28 +55,28 @@ _SAME_RAD = np.deg2rad(12.0)
 
 
 def yaw_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
-    """An object turned in place about the vertical through its centre of mass, by equal steps; a batch of poses.
+    """Return a batch of poses of an object turned about the vertical through its centre of mass, in equal steps.
 
     Args:
-        models: fields, for the centre of mass.
-        params: the guess; the object's own pose is not among the result.
-        number: of the object.
+        models: models of the objects, for the centre of mass.
+        params: the guess. The result does not contain the object's present pose.
+        number: index of the object.
     """
     quaternions = quaternion_multiply(full_circle(_YAWS)[1:], params.quaternions[number][None])
     return models.resting(params.names[number]).poses_at(models.centre_of_mass(params, number), quaternions)
 
 
 def side_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
-    """An object tipped over in place, by the least rotation, onto each side that it may lie on; a batch of poses.
+    """Return a batch of poses of an object tipped over, by the smallest rotation, onto each side that it may lie on.
 
-    A can on its side is rolled about its axis so: labels that repeat around it make it look alike in coarse images.
-    Each pose is among the result also turned by 180 deg about the vertical. The axis of a rotation by about 180 deg is
-    the object's longest one.
+    For a can on its side this includes rolling about its axis: a label that repeats around it makes these poses look
+    alike in coarse images. Each pose comes also turned by 180 deg about the vertical. The axis of a rotation by about
+    180 deg is the object's longest one.
 
     Args:
-        models: fields, for the sides, and the centre of mass.
-        params: the guess; the side that the object lies on is not among the result.
-        number: of the object.
+        models: models of the objects, for the sides and the centre of mass.
+        params: the guess. The result does not contain the side that the object lies on.
+        number: index of the object.
     """
     resting, own = models.resting(params.names[number]), params.quaternions[number]
     sides = rotate(quaternion_conjugate(resting.quaternions), _DOWN)
@@ -105,20 +105,20 @@ def compare_orientations(
 ) -> tuple[GaussNewtonState, float]:
     """Compare an object's orientation with the best of other hypotheses.
 
-    None is refined where the object explains its pixels already and every hypothesis is far worse: under right
-    orientations residuals are 0.038 at most, under wrong ones 0.038 and more (`docs/notes/estimation.md`).
+    No hypothesis is refined if the object explains its pixels already and all hypotheses are far worse. Residuals were
+    at most 0.038 with right orientations, and at least 0.038 with wrong ones (`docs/notes/estimation.md`).
 
     Args:
-        models: fields.
-        rough: images in which hypotheses are ranked and first refined: they have the widest basins of attraction.
-        coarse: images in which the first of them are ranked again, and the best refined further.
-        fine: images in which the best of them is compared.
+        models: models of the objects and the table.
+        rough: images to rank hypotheses in and refine them first. They have the widest basins of attraction.
+        coarse: images to rank the best hypotheses in again, and to refine them further.
+        fine: images to compare the best hypothesis in.
         at: the scene so far.
-        number: of the object.
-        others: poses that it might have instead, a batch.
+        number: index of the object.
+        others: a batch of other poses of the object.
 
     Returns:
-        The better scene, and the ratio of the worse loss to the better one; infinite without a distinct hypothesis.
+        The better scene, and the ratio of the worse loss to the better one; infinite if no hypothesis differs.
     """
     name, own_quaternion = at.params.names[number], at.params.quaternions[number]
     far = others[models.turned(name, own_quaternion, others.quaternion) > _SAME_RAD]
@@ -149,16 +149,16 @@ def compare_orientations(
 def _refine(
     models: ObjectModels, views: ObservedViews, at: GaussNewtonState, number: int, pose: Pose, iterations: int
 ) -> GaussNewtonState:
-    """Refine one object from a pose by Gauss-Newton; its normal matrix stays that of before until it moves."""
+    """Refine one object from a pose by Gauss-Newton. Its normal matrix stays the same until it moves."""
     rival = replace(at.undamped(), params=at.params.with_pose(number, pose))
     return list(gauss_newton(models, views, rival, iterations=iterations, objects=(number,)))[-1]
 
 
 # Finding an object in one image without a mask: templates slid over the image, under every light at once.
 #
-# A matte object under any distant light looks nearly like a mixture of its images under four lights. A template is
-# those four; where it is put, the best mixture is a small least-squares problem. What counts is how much better it
-# explains its pixels than the bare table does, lit or in shadow.
+# A matte object under any distant light looks nearly like a mixture of its images under four lights. A template
+# consists of these four images. At each place, the best mixture is a small least-squares problem. The score of a place
+# is how much better the mixture explains the pixels than the bare table, lit or in shadow.
 
 
 _BASIS = np.array([[0, 0, 1.0], [0.8, 0, 0.6], [-0.4, 0.48**0.5, 0.6], [-0.4, -(0.48**0.5), 0.6]])  # toward the lights
@@ -173,11 +173,11 @@ _NEAR_M, _NEAR_RAD = 0.02, np.deg2rad(20.0)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TemplateMatches:
-    """Where an object may be in an image, the most likely first.
+    """Poses that an object may have in an image, the most likely first.
 
     Attributes:
         poses: K poses `T_world_object`.
-        scores: by how much each explains its pixels better than the table does.
+        scores: how much better each pose explains its pixels than the table does.
     """
 
     poses: Pose
@@ -185,18 +185,18 @@ class TemplateMatches:
 
     @staticmethod
     def none() -> TemplateMatches:
-        """Matches of an object that was not found."""
+        """Return empty matches, of an object that was not found."""
         return TemplateMatches(Pose.identity(0), np.zeros(0))
 
 
 def table_errors(models: ObjectModels, views: ObservedViews, lit: float | None = None) -> Float[np.ndarray, "h w"]:
-    """Squared error of the first view's pixels if they show the table.
+    """Return the squared error of each pixel of the first view if it shows the table.
 
     Args:
-        models: fields.
-        views: what was observed.
-        lit: light on the lit table, see `lit_table_level`: then each pixel shows that, or shadow. Else it is lit or
-            shaded at will, and grey objects pass for table, too.
+        models: models of the objects and the table.
+        views: the images.
+        lit: light on the lit table, see `lit_table_level`. Each pixel then shows the lit table or shadow. If None, any
+            brightness is accepted, so that grey objects look like table as well.
     """
     table = models.together.render(empty_scene(OVERHEAD), views.cameras[:1], quality=QUALITY).rgb[0, 0]
     image = views.images[0]
@@ -210,11 +210,11 @@ def table_errors(models: ObjectModels, views: ObservedViews, lit: float | None =
 
 
 def scene_errors(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> Float[np.ndarray, "h w"]:
-    """Squared error of the first view's pixels, summed over the colours and truncated.
+    """Return the squared error of each pixel of the first view, summed over the colours and truncated.
 
     Args:
-        models: fields.
-        views: what was observed; only the first view counts.
+        models: models of the objects and the table.
+        views: the images, of which only the first is used.
         params: the scene to render, such as the objects found so far.
     """
     rendered = models.together.render(params.repeated(), views.cameras[:1], quality=QUALITY)
@@ -232,17 +232,17 @@ def match_templates(
     behind: Float[np.ndarray, "h w"] | None = None,
     light: Float[np.ndarray, "3"] | None = None,
 ) -> TemplateMatches:
-    """Look for an object in the first view, in given orientations and at given heights of its origin [m].
+    """Search an object in the first view, in given orientations and at given heights of its origin [m].
 
     Args:
-        models: fields.
-        views: what was observed.
-        name: of the object.
-        quaternions: of the orientations.
-        heights: for each of them.
-        most: how many matches are kept.
-        behind: squared errors of the pixels without the object; those of the table under its own light by default.
-        light: unit vector toward the light, where it is known; any light else.
+        models: models of the objects and the table.
+        views: the images.
+        name: name of the object.
+        quaternions: quaternions of the orientations.
+        heights: height of the origin above the table for each orientation [m].
+        most: largest number of matches.
+        behind: squared errors of the pixels without the object; those of the bare table by default.
+        light: unit vector toward the light; None to allow any light.
     """
     lights = _BASIS if light is None else light[None]
     camera, image = views.cameras[0], views.images[0]
@@ -266,7 +266,7 @@ def _match_at_anchor(
     lights: np.ndarray,
     anchor: tuple[float, float],
 ) -> tuple[np.ndarray, ...]:
-    """Find the best places of each orientation around an anchor: positions, orientations, scores."""
+    """Return the best places of each orientation around an anchor: positions, orientations, scores."""
     resting = models.resting(name)
     positions = np.column_stack([np.tile(anchor, (len(heights), 1)), heights])
     centre = positions[0] + rotate(quaternions[0], resting.centre)
@@ -296,7 +296,7 @@ def _match_at_anchor(
 
 
 def _best_per_block(scores: np.ndarray, places: np.ndarray, side: float) -> Int[np.ndarray, "B K"]:
-    """Find the window where each template scores best, in each square block of shifted windows."""
+    """Return the window with the best score of each template, in each square block of shifted windows."""
     blocks = np.floor(places / max(side, 1.0)).astype(int)
     members = [np.flatnonzero((blocks == block).all(axis=1)) for block in np.unique(blocks, axis=0)]
     return np.stack([own[scores[own].argmax(axis=0)] for own in members])
@@ -305,7 +305,7 @@ def _best_per_block(scores: np.ndarray, places: np.ndarray, side: float) -> Int[
 def _patches(image: np.ndarray, x: int, y: int, side: int, shift: int) -> tuple[np.ndarray, np.ndarray]:
     """Cut shifted windows out of an image, S x side x side x c; return them and their shifts (x, y) [px].
 
-    Beyond the image's border everything is black, and the table explains it.
+    Pixels beyond the image's border are black and count as table.
     """
     border = side + shift
     wide = np.pad(image, ((border, border), (border, border), (0, 0)))
@@ -321,7 +321,7 @@ def _scores(
     models: ObjectModels, camera: Camera, name: str, positions: np.ndarray, quaternions: np.ndarray,
     directions: np.ndarray, patches: np.ndarray,
 ) -> Float[np.ndarray, "S K"]:  # fmt: skip
-    """Compute how much better each of K templates explains each of S windows than the table does."""
+    """Return how much better each of K templates explains each of S windows than the table does."""
     count, lights = len(positions), len(directions)
     batch = SceneBatch(
         (name,),
@@ -345,7 +345,7 @@ def _scores(
 
 
 def _non_maximum_suppression(poses: Pose, scores: np.ndarray, most: int) -> TemplateMatches:
-    """Keep the best ones that differ in place or orientation."""
+    """Keep the best matches that differ in place or orientation."""
     order = np.argsort(-scores)
     poses, scores = poses[order], scores[order]
     tree, kept, left = KDTree(poses.position), [], np.ones(len(scores), bool)
@@ -360,11 +360,11 @@ def _non_maximum_suppression(poses: Pose, scores: np.ndarray, most: int) -> Temp
     return TemplateMatches(poses[kept], scores[kept])
 
 
-# Scenes put together from matches: which of them explain an image together, its light being unknown.
+# Scenes made of matches: which matches explain an image together, under an unknown light.
 #
-# Objects and light depend on each other: under a wrong light a wrong scene may look right. So it is begun under
-# lights all over the hemisphere, on rough images, and the best of these scenes are sorted out on finer ones. Last,
-# objects are replaced two at a time: one that stands in another's place keeps it from there.
+# Objects and light depend on each other: under a wrong light a wrong scene may look right. The search therefore begins
+# under lights all over the hemisphere, on rough images, and compares the best scenes on finer images. Finally, objects
+# are replaced two at a time, because an object in the place of another one blocks that place.
 
 
 OUT_OF_VIEW = Pose(np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0, 0.0]))  # below the table: not in the image
@@ -377,13 +377,13 @@ _PLACES, _APART_M, _SECOND = 8, 0.03, 40  # places tried for the first of two ob
 def reassign_poses(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, matches: list[TemplateMatches]
 ) -> SceneParameters:
-    """Put each object in turn at the match that explains whole images better than its pose does, if any does.
+    """Move each object in turn to a match that explains the whole images better than its pose, if there is one.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         views: images to compare with.
-        params: the guess.
-        matches: of each object, in the guess's order.
+        params: guess of the scene.
+        matches: matches of each object, in the order of the guess.
     """
     for n, found in enumerate(matches):
         params, _ = best_placement(models, views, params, n, found)
@@ -393,14 +393,14 @@ def reassign_poses(
 def best_placement(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, n: int, found: TemplateMatches
 ) -> tuple[SceneParameters, float]:
-    """Put an object where the photometric loss is least, where it is or at a match; return the scene and its loss.
+    """Move an object to the match with the least photometric loss, or leave it; return the scene and its loss.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         views: images to compare with.
-        params: the guess.
-        n: number of the object.
-        found: its matches, perhaps none.
+        params: guess of the scene.
+        n: index of the object.
+        found: its matches, which may be empty.
     """
     own, losses = loss_of(models, views, params), _losses(models, views, params, n, found)
     if losses.min(initial=np.inf) >= own:
@@ -411,30 +411,30 @@ def best_placement(
 def _losses(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, n: int, found: TemplateMatches
 ) -> Float[np.ndarray, "K"]:
-    """Loss of the guess with an object at each of its matches."""
+    """Return the loss of the guess with an object at each of its matches."""
     return pose_losses(models, views, params, n, found.poses) if len(found.scores) else np.zeros(0)
 
 
 def count_of_scenes(objects: int) -> int:
-    """Return how many scenes `SceneAssembly.scenes` yields."""
+    """Return the number of scenes that `SceneAssembly.scenes` yields."""
     return 1 + len(hemisphere(_LIGHTS)) + _KEPT_ROUGH + _KEPT + objects * (objects - 1) // 2 + 1
 
 
 def without_objects(params: SceneParameters, numbers: Iterable[int]) -> SceneParameters:
-    """The guess with some objects away."""
+    """Return the guess without some of its objects."""
     for n in numbers:
         params = params.with_pose(n, OUT_OF_VIEW)
     return params
 
 
 class SceneAssembly:
-    """Puts scenes together from matches.
+    """Builds scenes from matches.
 
     Args:
-        models: fields.
-        rough: images for all lights.
-        coarse: images for the best of them.
-        matches: of each object.
+        models: models of the objects and the table.
+        rough: images to try all lights in.
+        coarse: images to compare the best scenes in.
+        matches: matches of each object.
     """
 
     def __init__(
@@ -443,10 +443,10 @@ class SceneAssembly:
         self._models, self._rough, self._coarse, self._sightings = models, rough, coarse, matches
 
     def scenes(self, start: SceneParameters) -> Iterator[tuple[SceneParameters, float]]:
-        """Yield the best scene so far and its loss, each time one more was tried.
+        """Yield the best scene so far and its loss after each scene that was tried.
 
         Args:
-            start: one scene to begin with; the others begin with no object.
+            start: one scene to begin with. All others begin without objects.
         """
         empty = without_objects(start, range(len(self._sightings)))
         scenes = [start, *(replace(empty, light=light) for light in hemisphere(_LIGHTS))]
@@ -464,7 +464,7 @@ class SceneAssembly:
         yield self._alternated(params, self._coarse)
 
     def quick_scene(self, names: tuple[str, ...]) -> SceneParameters:
-        """Put a scene together under few lights, good enough to decide whether the objects are there at all."""
+        """Return a scene built under few lights, which is enough to decide whether the objects are there."""
         nowhere = Pose.stacked([OUT_OF_VIEW] * len(names))
         empty = SceneParameters(names, nowhere.position, nowhere.quaternion, OVERHEAD, None)
         begun = [self._alternated(replace(empty, light=light), self._rough) for light in hemisphere(_FEW_LIGHTS)]
@@ -474,13 +474,13 @@ class SceneAssembly:
         return params
 
     def _alternated(self, params: SceneParameters, views: ObservedViews) -> tuple[SceneParameters, float]:
-        """Put each object in turn at its best match, then search the light."""
+        """Move each object in turn to its best match, then search the light."""
         params = reassign_poses(self._models, views, params, self._sightings)
         params = replace(params, light=search_light(self._models, self._rough, views, params))
         return params, loss_of(self._models, views, params)
 
     def _replaced(self, params: SceneParameters, loss: float, pair: tuple[int, int]) -> tuple[SceneParameters, float]:
-        """Take two objects away and put them elsewhere, the first in each of its best places, if that is better."""
+        """Move two objects at once if that is better, trying each of the best places of the first."""
         best, least = params, loss
         first, second = pair
         rest = without_objects(params, pair)
@@ -494,7 +494,7 @@ class SceneAssembly:
         return best, least
 
     def _best_places(self, params: SceneParameters, n: int) -> list[int]:
-        """Return numbers of an object's matches that explain the image best, each in a place of its own."""
+        """Return the indices of an object's matches that explain the image best, at most one in each place."""
         positions, kept = self._sightings[n].poses.position, []
         for k in self._ranking(params, n).tolist():
             if not kept or np.linalg.norm(positions[kept] - positions[k], axis=1).min() > _APART_M:

@@ -1,4 +1,4 @@
-"""What an estimate minimises: parameters of a scene, models of objects and table, losses of paper eq. 5 and 6."""
+"""The objective of an estimate: scene parameters, models of objects and table, and the losses of paper eq. 5 and 6."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class SceneParameters:
     """The scene at which the parameter vector is zero.
 
     Attributes:
-        names: of the N objects.
-        positions: of the objects [m].
-        quaternions: unit.
+        names: names of the N objects.
+        positions: positions of the objects in the world [m].
+        quaternions: orientations of the objects in the world as unit quaternions (w, x, y, z).
         light: unit vector toward the light.
-        pusher: its centre [m], or None.
+        pusher: centre of the pusher in the world [m], or None.
     """
 
     names: tuple[str, ...]
@@ -55,7 +55,7 @@ class SceneParameters:
 
     @staticmethod
     def of(state: SceneState, pusher: Float[np.ndarray, "3"] | None) -> SceneParameters:
-        """The objects and the light of a state, with this pusher."""
+        """Return the parameters of a state, with this pusher."""
         return SceneParameters(state.names, state.poses.position, state.poses.quaternion, state.light.direction, pusher)
 
     @property
@@ -64,17 +64,17 @@ class SceneParameters:
         return POSE * len(self.names) + LIGHT
 
     def pose(self, number: int) -> Pose:
-        """`T_world_object` of one object."""
+        """Return `T_world_object` of one object."""
         return Pose(self.positions[number], self.quaternions[number])
 
     def with_pose(self, number: int, pose: Pose) -> SceneParameters:
-        """The scene with one object in another pose `T_world_object`."""
+        """Return the scene with one object in another pose `T_world_object`."""
         positions, quaternions = self.positions.copy(), self.quaternions.copy()
         positions[number], quaternions[number] = pose.position, pose.quaternion
         return replace(self, positions=positions, quaternions=quaternions)
 
     def state(self) -> SceneState:
-        """The scene as a state."""
+        """Return the scene as a state."""
         return SceneState(self.names, Pose(self.positions, self.quaternions), Light(self.light), self.pusher)
 
     def perturbed(self, changes: Float[np.ndarray, "B P"]) -> SceneBatch:
@@ -97,7 +97,7 @@ class SceneParameters:
         return replace(self, positions=batch.positions[0], quaternions=batch.quaternions[0], light=batch.lights[0])
 
     def repeated(self, count: int = 1) -> SceneBatch:
-        """Return a batch of the scene itself, `count` times."""
+        """Return a batch with `count` copies of the scene."""
         return self.perturbed(np.zeros((count, self.size)))
 
 
@@ -106,11 +106,11 @@ def empty_scene(light: Float[np.ndarray, "3"]) -> SceneBatch:
     return SceneBatch((), np.zeros((1, 0, 3)), np.zeros((1, 0, 4)), light[None], None)
 
 
-# How an object can lie on a table, from its field alone.
+# The resting orientations of an object, from its field alone.
 #
-# The height of the centre of mass over the table is a function of the direction that points down. Where it has a
-# minimum the object lies stably; where it hardly changes from one direction to the next, as for a can on its side,
-# every one of them is kept.
+# The height of the centre of mass over the table is a function of the direction that points down. At a minimum of it
+# the object lies stably. Where the height hardly changes between neighbouring directions, as for a can on its side, all
+# of them are kept.
 
 
 _OPAQUE_G = 2.0  # density feature above which a corner counts as solid
@@ -146,9 +146,9 @@ class RestingOrientations:
 
     Attributes:
         quaternions: rotations from the object's frame to the world.
-        heights: of the centre of mass above the table [m].
+        heights: heights of the centre of mass above the table [m].
         centre: the centre of mass of a solid body of that shape, in the object's frame [m].
-        radius: of the sphere around that centre that holds the object [m].
+        radius: radius of the sphere around that centre that holds the object [m].
         hull: vertices of the convex hull, in the object's frame [m].
     """
 
@@ -160,15 +160,15 @@ class RestingOrientations:
 
     @property
     def origin_heights(self) -> Float[np.ndarray, "K"]:
-        """Height of the object's origin above the table in each orientation [m]."""
+        """Return the height of the object's origin above the table in each orientation [m]."""
         return self.heights - rotate(self.quaternions, self.centre)[:, 2]
 
     def lowest(self, pose: Pose) -> float:
-        """Height of the lowest point of the object in a pose [m]."""
+        """Return the height of the lowest point of the object in a pose [m]."""
         return float(pose.apply(self.hull)[:, 2].min())
 
     def poses_at(self, centres: Float[np.ndarray, "... 3"], quaternions: Float[np.ndarray, "K 4"]) -> Pose:
-        """Return K poses in given orientations whose centres of mass lie at one place or at K places [m]."""
+        """Return K poses in these orientations, with the centres of mass at one place or at K places [m]."""
         return Pose(centres - rotate(quaternions, self.centre), quaternions)
 
 
@@ -195,7 +195,7 @@ def full_circle(steps: int) -> Float[np.ndarray, "steps 4"]:
 
 
 def _solid(field: DensityGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices of the convex hull of what is opaque, and the hull's centre of mass."""
+    """Return the vertices and the centre of mass of the convex hull of the opaque corners."""
     solid = np.argwhere(field.density > min(_OPAQUE_G, float(field.density.max()) - 1))
     points = field.origin + field.voxel * solid
     hull = ConvexHull(points, qhull_options="QJ")  # joggled: a flat or degenerate field still has a hull
@@ -208,7 +208,7 @@ def _solid(field: DensityGrid) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _stable(directions: np.ndarray, heights: np.ndarray) -> list[int]:
-    """Directions that are (almost) the lowest around them, thinned out, the lowest first."""
+    """Return directions that are (almost) the lowest among their neighbours, thinned out, the lowest first."""
     cosines = directions @ directions.T
     lowest = np.where(cosines > np.cos(np.deg2rad(_NEIGHBOURHOOD_DEG)), heights, np.inf).min(axis=1)
     candidates = np.flatnonzero(heights <= lowest + _SLACK_M)
@@ -220,7 +220,7 @@ def _stable(directions: np.ndarray, heights: np.ndarray) -> list[int]:
 
 
 def _rotation_downwards(direction: np.ndarray) -> np.ndarray:
-    """A rotation that takes a unit vector to (0, 0, -1)."""
+    """Return a rotation that takes a unit vector to (0, 0, -1)."""
     axis = np.cross(direction, (0.0, 0.0, -1.0))
     sine = np.linalg.norm(axis)
     if sine < 1e-9:  # along the vertical already
@@ -228,7 +228,7 @@ def _rotation_downwards(direction: np.ndarray) -> np.ndarray:
     return quaternion_exp(axis / sine * np.arctan2(sine, -direction[2]))
 
 
-# What is known before any image: how each object looks, how it can lie, and how the table looks.
+# Known before any image: how each object looks, how it can lie, and how the table looks.
 
 
 QUALITY: Quality = PLANNING
@@ -236,11 +236,25 @@ FieldT = TypeVar("FieldT", bound=DensityGrid)
 
 
 class ObjectModels:
-    """Fields of the objects, and two renderers of them.
+    """What an estimator knows of the objects: their fields, renderers of them, and their symmetries.
+
+    Args:
+        fields: fields of the objects, by name.
+        table: field of the table.
+        device: where images are rendered, as in `SceneRenderer`.
+        symmetries: orientations of each object that look the same; none for objects that are left out.
 
     Attributes:
-        alone: draws objects over black.
-        together: draws them on the table.
+        alone: renderer of the objects over black.
+        together: renderer of the objects on the table.
+
+    Raises:
+        InvalidInput: if there is no such device.
+
+    Example:
+        >>> models = ObjectModels({name: fields.load(name)}, fields.load_table())
+        >>> models.together.names
+        ('006_mustard_bottle',)
     """
 
     def __init__(
@@ -251,17 +265,6 @@ class ObjectModels:
         device: str = "cpu",
         symmetries: Mapping[str, Symmetry] | None = None,
     ) -> None:
-        """Prepare fields.
-
-        Args:
-            fields: by name of the object.
-            table: what the objects lie on.
-            device: where images are rendered, see `SceneRenderer`.
-            symmetries: which orientations of an object look the same; none of those left out.
-
-        Raises:
-            InvalidInput: if there is no such device.
-        """
         alone, together = (SceneRenderer(fields, ground, device=device) for ground in (None, table))
         self._set(fields, alone, together)
         self._changeable = fields, table, device
@@ -274,12 +277,12 @@ class ObjectModels:
         fields: Mapping[str, FieldT],
         table: TableField,
     ) -> ObjectModels:
-        """Models whose fields another renderer draws.
+        """Return models whose fields another renderer draws.
 
         Args:
-            renderer: makes renderers of fields, on a table or over black.
-            fields: by name of the object.
-            table: what the objects lie on.
+            renderer: makes a renderer of fields, on a table or over black.
+            fields: fields of the objects, by name.
+            table: field of the table.
         """
         models = cls.__new__(cls)
         models._set(fields, renderer(fields, None), renderer(fields, table))
@@ -294,21 +297,21 @@ class ObjectModels:
 
     @property
     def can_change(self) -> bool:
-        """Whether `changed` works, which it does not where another renderer draws fields of its own kind."""
+        """Whether `changed` works. It does not work with models made by `rendered_by`."""
         return self._changeable is not None
 
     def changed(
         self, names: Iterable[str], field: Callable[[KiloOSF], KiloOSF], table: Callable[[TableField], TableField]
     ) -> ObjectModels:
-        """Models of some of the objects with another look and the same shapes.
+        """Return models of some of the objects that look different but have the same shapes.
 
         Args:
-            names: of the objects.
-            field: from a field to the one in its place, of the same density.
-            table: likewise of the table.
+            names: names of the objects.
+            field: maps each field to its replacement, which must have the same density.
+            table: maps the table to its replacement.
 
         Raises:
-            InvalidInput: where `can_change` is false.
+            InvalidInput: if `can_change` is false.
         """
         if self._changeable is None:
             raise InvalidInput(
@@ -321,10 +324,10 @@ class ObjectModels:
         return models
 
     def check(self, names: tuple[str, ...]) -> None:
-        """Refuse objects without a field.
+        """Check that objects have a field.
 
         Raises:
-            UnknownName: if one has none.
+            UnknownName: if an object has none.
         """
         for name in names:
             if name not in self._fields:
@@ -333,19 +336,19 @@ class ObjectModels:
     def turned(
         self, name: str, one: Float[np.ndarray, "4"], others: Float[np.ndarray, "B 4"]
     ) -> Float[np.ndarray, "B"]:
-        """Angles between an object's orientations [rad], over all that look like `one`."""
+        """Return the angles [rad] from each of `others` to the nearest orientation that looks like `one`."""
         symmetry = self._symmetries.get(name, Symmetry("none"))
         return np.array([rotation_error(symmetry, other, one) for other in others])
 
     def resting(self, name: str) -> RestingOrientations:
-        """Return how an object can lie on a table; it is found when first asked for."""
+        """Return the orientations in which an object can rest on a table. The first call computes them."""
         if name not in self._resting:
             self.check((name,))
             self._resting[name] = resting_orientations(self._fields[name])
         return self._resting[name]
 
     def centre_of_mass(self, params: SceneParameters, number: int) -> Float[np.ndarray, "3"]:
-        """Where the centre of mass of an object of a scene is [m]."""
+        """Return the centre of mass of one object of a scene, in the world [m]."""
         centre = self.resting(params.names[number]).centre
         return params.positions[number] + rotate(params.quaternions[number], centre)
 
@@ -368,8 +371,8 @@ class ObservedViews:
         images: linear RGB.
         masks: share of each pixel that shows each object, or None.
         pusher: centre of the pusher [m], or None.
-        quality: of what is rendered to compare with.
-        only: pixels that count, where not all do.
+        quality: quality of the renderings that are compared with the images.
+        only: pixels that are compared; None for all.
     """
 
     cameras: tuple[Camera, ...]
@@ -381,11 +384,11 @@ class ObservedViews:
 
 
 def views_of(observation: Observation, side: int, *, samples: int = 1) -> ObservedViews:
-    """An observation at the resolution at which it is compared with renderings.
+    """Return an observation at the resolution at which it is compared with renderings.
 
     Args:
-        observation: images are reduced by area averaging, never enlarged.
-        side: longest side of the result [px]; the other does not fall below 16 px.
+        observation: the observation. Its images are reduced by area averaging, never enlarged.
+        side: longest side of the result [px]. The other side is at least 16 px.
         samples: rays along each side of a rendered pixel.
     """
     height, width = observation.images.shape[1:3]
@@ -407,15 +410,15 @@ def _resize(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ObjectView:
-    """The windows of V views around one object; all of one size.
+    """Windows of V views around one object, all of one size.
 
     Attributes:
-        cameras: that see the windows alone.
+        cameras: cameras that see only the windows.
         rgb: the object over black (paper eq. 5: image times mask).
         mask: share of each pixel that shows it.
         valid: pixels in which no other object hides it.
-        area: of the mask [px]; at least 1.
-        quality: of what is rendered to compare with.
+        area: area of the mask [px]; at least 1.
+        quality: quality of the renderings that are compared with the windows.
     """
 
     cameras: tuple[Camera, ...]
@@ -427,11 +430,11 @@ class ObjectView:
 
 
 def crop_to_masks(views: ObservedViews, number: int) -> ObjectView:
-    """The windows around one object's masks.
+    """Return the windows around the masks of one object.
 
     Args:
-        views: with masks; views in which the object's is empty are left out, and at least one must not be.
-        number: of the object.
+        views: images with masks. Views with an empty mask of the object are left out; at least one must not be empty.
+        number: index of the object.
     """
     assert views.masks is not None
     shown = [v for v, mask in enumerate(views.masks[:, number]) if mask.max() > 0.5]
@@ -454,14 +457,14 @@ def crop_to_masks(views: ObservedViews, number: int) -> ObjectView:
 def crop_to_object(
     views: ObservedViews, models: ObjectModels, params: SceneParameters, number: int, *, reach: float = 0.0
 ) -> ObservedViews:
-    """The windows around one object of a guess, without masks, or whole images if none shows it.
+    """Return the windows around one object of a guess, without masks; whole images if none shows it.
 
     Args:
-        views: whole images; those that do not show the object are left out.
-        models: fields, for the object's bounding sphere.
-        params: the guess.
-        number: of the object.
-        reach: by how much the windows reach beyond that sphere [m].
+        views: whole images. Those that do not show the object are left out.
+        models: models of the objects, for the bounding sphere.
+        params: guess of the scene.
+        number: index of the object.
+        reach: margin of the windows around that sphere [m].
     """
     radius, centre = models.resting(params.names[number]).radius, models.centre_of_mass(params, number)
     height, width = views.images.shape[1:3]
@@ -488,13 +491,13 @@ def crop_to_object(
 def crop_to_silhouette(
     views: ObservedViews, models: ObjectModels, params: SceneParameters, number: int
 ) -> ObservedViews:
-    """The windows around one object of a guess, of which only pixels in or just beside its silhouette count.
+    """Return the windows around one object of a guess, in which only pixels at its silhouette count.
 
     Args:
         views: whole images.
-        models: fields; the object is rendered alone for its silhouette.
-        params: the guess.
-        number: of the object.
+        models: models of the objects, to render the silhouette.
+        params: guess of the scene.
+        number: index of the object.
     """
     own = crop_to_object(views, models, params, number)
     alone = SceneBatch((params.names[number],), params.positions[None, [number]], params.quaternions[None, [number]],
@@ -508,14 +511,14 @@ def crop_to_silhouette(
 
 
 def crop_camera(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
-    """The camera that sees a window of another's image.
+    """Return a camera that sees only a window of another camera's image.
 
     Args:
-        camera: the other.
+        camera: the other camera.
         x: left edge of the window in its image [px]; may lie outside.
-        y: upper edge likewise [px].
-        width: of the window [px].
-        height: of the window [px].
+        y: upper edge of the window [px]; may lie outside.
+        width: width of the window [px].
+        height: height of the window [px].
 
     Raises:
         InvalidInput: if the window's sides are outside 16 to 1024 px.
@@ -526,7 +529,7 @@ def crop_camera(camera: Camera, x: int, y: int, width: int, height: int) -> Came
 
 
 def _crop_windows(masks: Bool[np.ndarray, "V h w"]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Corners (x, y) of windows around masks, none of them empty, and their common width and height [px]."""
+    """Return corners (x, y) of windows around masks that are not empty, and their common width and height [px]."""
     height, width = masks.shape[1:]
     boxes = []
     for mask in masks:
@@ -549,11 +552,11 @@ HUBER = 0.1  # h [radiance]
 
 
 def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> Float32[np.ndarray, "B V h w 3"]:
-    """Rendered minus observed [radiance]; 0 where pixels do not count.
+    """Return rendered minus observed images [radiance]; 0 at pixels that do not count.
 
     Args:
-        models: fields of the objects and the table.
-        views: what was observed.
+        models: models of the objects and the table.
+        views: the images.
         batch: B scenes to render.
     """
     rendered = models.together.render(batch, views.cameras, quality=views.quality, only=views.only)
@@ -561,22 +564,22 @@ def residuals(models: ObjectModels, views: ObservedViews, batch: SceneBatch) -> 
 
 
 def photometric_loss(errors: Float[np.ndarray, "B *pixels"]) -> Float[np.ndarray, "B"]:
-    """Mean Huber loss over all pixels and colours of each scene.
+    """Return the mean Huber loss over all pixels and colours of each scene.
 
     rho(r) = r^2 / 2 for |r| < h, h (|r| - h / 2) otherwise, with h = HUBER.
 
-    Deviation from paper eq. 6, the mean square: outliers such as specular highlights count linearly.
+    Deviation from paper eq. 6, which is the mean square: outliers such as specular highlights count linearly.
     """
     size = np.abs(errors.reshape(len(errors), -1))
     return np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER)).mean(axis=1, dtype=float)
 
 
 def loss_of(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
-    """Photometric loss of one scene.
+    """Return the photometric loss of one scene.
 
     Args:
-        models: fields of the objects and the table.
-        views: what was observed.
+        models: models of the objects and the table.
+        views: the images.
         params: the scene.
     """
     return float(photometric_loss(residuals(models, views, params.repeated()))[0])
@@ -585,13 +588,13 @@ def loss_of(models: ObjectModels, views: ObservedViews, params: SceneParameters)
 def pose_losses(
     models: ObjectModels, views: ObservedViews, params: SceneParameters, number: int, poses: Pose
 ) -> Float[np.ndarray, "K"]:
-    """Photometric loss of a scene with one object in each of K poses.
+    """Return the photometric loss of a scene with one object in each of K poses.
 
     Args:
-        models: fields.
-        views: images to compare with, whole ones or windows around the object.
-        params: the guess; all other objects and the light stay.
-        number: of the object.
+        models: models of the objects and the table.
+        views: images to compare with: whole images or windows around the object.
+        params: the guess, in which all other objects and the light stay.
+        number: index of the object.
         poses: the K poses, a batch of `T_world_object`.
     """
     batch = params.repeated(len(poses.position))
@@ -613,7 +616,7 @@ class RenderedObject:
     """Renderings of one object in B poses, cropped as its `ObjectView`.
 
     Attributes:
-        rgb: over black.
+        rgb: linear radiance of the object over black.
         opacity: share of each pixel that shows it.
     """
 
@@ -627,8 +630,8 @@ def render_poses(
     """Render one object in B poses, alone.
 
     Args:
-        models: fields.
-        name: of the object.
+        models: models of the objects and the table.
+        name: name of the object.
         part: the crop whose cameras and quality are used.
         poses: the B poses, a batch of `T_world_object`.
         light: unit vector toward the light, the same for all poses.
@@ -641,20 +644,21 @@ def render_poses(
 
 
 def masked_loss(look: RenderedObject, part: ObjectView, *, any_brightness: bool = False) -> Float[np.ndarray, "B"]:
-    """Silhouette and colour error of each pose; 0 is perfect.
+    """Return the silhouette and colour error of each pose; 0 is perfect.
 
     With rendered opacity o, mask m, validity v, the mask's area A in each view, and P the pixels of both silhouettes:
 
         L = sum_views A / sum(A) * [ sum |o - m| v / A  +  w * sum_P min(|c_rendered - c_observed|, e_max) / A ]
 
-    Deviations from paper eq. 5, the mean squared error inside the masks: absolute errors, truncated at e_max, so that
-    shadows of other objects, which are not rendered here, do not decide; the silhouette is a term of its own; pixels
-    that other objects may cover are left out.
+    Deviations from paper eq. 5, the mean squared error inside the masks: errors are absolute and truncated at e_max, so
+    that shadows of other objects, which are not rendered here, have little weight. The silhouette has a term of its
+    own. Pixels that other objects may cover are left out.
 
     Args:
         look: rendered images of B poses.
         part: the observed crop of each view.
-        any_brightness: scale colours by the least-squares factor of each pose and view: the light is not known yet.
+        any_brightness: whether to scale colours by the least-squares factor of each pose and view, because the light is
+            not known yet.
 
     Returns:
         The loss of each pose.

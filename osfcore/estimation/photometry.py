@@ -1,4 +1,4 @@
-"""The image model of pictures of unknown exposure, response, ambient light and table: check, and fit at known poses."""
+"""The image model for unknown exposure, response, ambient light and table: a check, and a fit at known poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 
-# Whether pictures show the table as it is known, from its pixels alone: a check before any estimate.
+# A check before any estimate whether images show the table as expected, from its pixels alone.
 #
 # Every pixel of the known table obeys I_c = albedo_c (ambient + x direct), with x = 0 in shadow and the same x
 # where the lamp reaches it. Another exposure, response or ambient light moves the shadows away from x = 0, another
@@ -45,12 +45,12 @@ def check_table(models: ObjectModels, views: ObservedViews) -> TableVerdict:
     """Compare the table's pixels with the known table.
 
     Args:
-        models: of which the table is used.
-        views: pictures with masks.
+        models: models, of which only the table is used.
+        views: images with masks.
 
     Returns:
-        "usual", or "other" where something speaks against the usual image model; "unclear" where no full shadow is
-        seen: then another lamp may explain what another exposure does.
+        "usual" if the table looks as expected; "other" if it does not; "unclear" if no full shadow is visible, because
+        another lamp and another exposure then look the same.
     """
     x, error, on_table = table_light(models, views)
     table = _table_pixels(views, on_table)
@@ -67,7 +67,7 @@ def check_table(models: ObjectModels, views: ObservedViews) -> TableVerdict:
 
 
 def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:
-    """Find pixels that show nothing but table, well within its edge."""
+    """Return which pixels show only table, well within its edge."""
     reach = _MASK_ERROR_PX + round(_BESIDE * max(on_table.shape[1:]))
     kernel = np.ones((2 * reach + 1,) * 2, np.uint8)
     other = ~on_table
@@ -79,7 +79,7 @@ def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:
 
 
 def _pusher_pixels(views: ObservedViews) -> np.ndarray:
-    """Draw the pusher's outline in each view, about, from points of its axis."""
+    """Return which pixels show the pusher, approximately, from points on its axis."""
     assert views.pusher is not None
     shown = np.zeros(views.images.shape[:3], np.uint8)
     axis = views.pusher + np.linspace(-0.5, 0.5, 9)[:, None] * [0.0, 0.0, PUSHER_HEIGHT_M]
@@ -93,19 +93,19 @@ def _pusher_pixels(views: ObservedViews) -> np.ndarray:
     return shown > 0
 
 
-# Fields and tables with factors on albedo and ambient light: what an image model makes of those of the library.
+# Fields and tables adapted to an image model, by factors on albedo and ambient light.
 
 
 _ALBEDO = slice(1, 4)  # among a field's features
 
 
 def adapted(models: ObjectModels, names: Iterable[str], model: ImageModel) -> ObjectModels:
-    """Models of some objects that show what `ImageModel.normalized` pictures do.
+    """Return models of some objects that look as images normalized by `ImageModel.normalized`.
 
     Args:
-        models: not adapted yet.
-        names: of the objects.
-        model: of the pictures.
+        models: models that are not adapted yet.
+        names: names of the objects.
+        model: image model of the images.
     """
     return models.changed(
         names, lambda field: scaled_field(field, model.scale, model.ambient), lambda table: _adapted_table(table, model)
@@ -120,19 +120,19 @@ def _adapted_table(table: TableField, model: ImageModel) -> TableField:
 
 
 def scaled_field(field: KiloOSF, albedo: float, ambient: float) -> KiloOSF:
-    """A field with factors on its albedo and on its ambient light."""
+    """Return a field with factors on its albedo and on its ambient light."""
     rows = field.rows.copy()
     rows[:, _ALBEDO] *= np.float32(albedo)
     return replace(field, rows=rows, ambient=field.ambient * np.float32(ambient))
 
 
 def scaled_table(table: TableField, albedo: Float[np.ndarray, "3"], ambient: float) -> TableField:
-    """A table with factors on its albedo, per colour, and on its ambient light."""
+    """Return a table with factors on its albedo, per colour, and on its ambient light."""
     factors = np.asarray(albedo, np.float32)
     return replace(table, albedo=table.albedo * factors, ambient=table.ambient * np.float32(ambient))
 
 
-# The image model of pictures from roughly known poses: exposure, ambient light, table and lamp at once.
+# The image model from roughly known poses: exposure, ambient light, table and lamp at once.
 #
 # With E the rendered ambient part of a scene and S(l) the rendered direct part under a lamp from l, shadows
 # included,
@@ -155,7 +155,7 @@ _SATURATED, _DARK = 0.985, 1e-6  # of full scale; where pictures are black, erro
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Calibration:
-    """Image model and lamp of some pictures.
+    """Image model and lamp of some images.
 
     Attributes:
         model: exposure, ambient light and table.
@@ -169,11 +169,11 @@ class Calibration:
 
 
 class Calibrator:
-    """Fits image models to pictures.
+    """Fits image models to images.
 
     Args:
-        models: fields as they were made.
-        names: of the objects in the pictures.
+        models: models that are not adapted.
+        names: names of the objects in the images.
     """
 
     def __init__(self, models: ObjectModels, names: tuple[str, ...]) -> None:
@@ -186,12 +186,12 @@ class Calibrator:
         )
 
     def search(self, rough: ObservedViews, fine: ObservedViews, params: SceneParameters) -> Calibration:
-        """Find lamp and image model, whatever they are.
+        """Search lamp and image model without an initial guess.
 
         Args:
-            rough: pictures on which the hemisphere is tried.
-            fine: pictures for what follows.
-            params: the objects; its light plays no part.
+            rough: images to try the whole hemisphere on.
+            fine: images to refine on.
+            params: the objects. The light is ignored.
         """
         pixels = self._pixels(rough, params)
         directions = hemisphere()
@@ -201,13 +201,13 @@ class Calibrator:
         return self._refined(fine, params, best, FIRST_STEP_RAD, _FIRST_FACTOR, LIGHT_ROUNDS)
 
     def refine(self, views: ObservedViews, params: SceneParameters, ambient: float, *, hold_light: bool) -> Calibration:
-        """Improve a calibration, now that the poses are known.
+        """Refine a calibration at known poses.
 
         Args:
-            views: pictures.
-            params: objects and lamp, near the truth.
-            ambient: r likewise.
-            hold_light: the lamp is where it is.
+            views: the images.
+            params: objects and lamp, close to the truth.
+            ambient: r, close to the truth.
+            hold_light: whether the lamp stays fixed.
         """
         step = 0.0 if hold_light else FIRST_STEP_RAD / 4
         return self._refined(views, params, [(params.light, ambient)], step, _FIRST_FACTOR**0.5, 3, kept=1)
@@ -243,7 +243,7 @@ class Calibrator:
         return Calibration(model, light, float(cost))
 
     def _pixels(self, views: ObservedViews, params: SceneParameters) -> _Pixels:
-        """Choose the pixels that count, with what is seen there and its ambient part."""
+        """Return the pixels that count, with their observed radiance and its rendered ambient part."""
         batch, nothing = params.repeated(), empty_scene(params.light)
         whole = self._whole.together.render(batch, views.cameras, quality=views.quality, outputs={"rgb", "opacity"})
         direct = self._direct.together.render(batch, views.cameras, quality=views.quality).rgb[0]
@@ -277,11 +277,11 @@ class _Pixels:
     """P pixels that the model describes.
 
     Attributes:
-        counted: where they are.
-        of_objects: those that show objects; the others show the table.
-        seen: their radiance.
-        ambient: E.
-        surroundings: median radiance beyond the table; None where nothing else is seen.
+        counted: mask of these pixels.
+        of_objects: which of them show objects; the others show the table.
+        seen: observed radiance.
+        ambient: E, rendered ambient part.
+        surroundings: median radiance beyond the table; None if nothing beyond it is visible.
     """
 
     counted: Bool[np.ndarray, "V h w"]
@@ -291,7 +291,7 @@ class _Pixels:
     surroundings: Float[np.ndarray, "3"] | None
 
     def costs(self, direct: Float32[np.ndarray, "L P 3"], ambients: Float[np.ndarray, "R"]) -> np.ndarray:
-        """Compute the mean truncated errors, L x R."""
+        """Return the mean truncated errors, L x R."""
         costs = np.zeros((len(direct), len(ambients)))
         for kind in (self.of_objects, ~self.of_objects):
             if not kind.any():
@@ -305,7 +305,7 @@ class _Pixels:
         return costs
 
     def gains(self, direct: Float32[np.ndarray, "P 3"], ambient: float) -> tuple[np.ndarray, np.ndarray]:
-        """Fit the gains of objects and table, per colour; where one of them does not show, that of the other."""
+        """Return the gains of objects and table, per colour. If one is not visible, it takes the other's gain."""
         found = []
         for kind in (self.of_objects, ~self.of_objects):
             if kind.any():

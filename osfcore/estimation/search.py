@@ -47,9 +47,9 @@ class CMAES:
     """One search that starts at zero.
 
     Args:
-        scales: what one standard deviation is in each number of the vector; 0 holds a number still.
+        scales: initial standard deviation of each number of the vector; 0 holds a number fixed.
         population: candidates per generation.
-        rng: all randomness.
+        rng: random generator.
     """
 
     def __init__(self, scales: Float[np.ndarray, "P"], population: int, rng: np.random.Generator) -> None:
@@ -59,29 +59,29 @@ class CMAES:
 
         self._free = np.flatnonzero(scales)
         self._scales = np.asarray(scales, float)
-        # Its own seed would seed numpy's global generator; nan leaves that alone.
+        # A seed here would seed numpy's global generator; nan does not.
         options = {"popsize": population, "randn": lambda *shape: rng.standard_normal(shape), "seed": math.nan,
                    "verbose": -9, "verb_log": 0}  # fmt: skip
         self._strategy = cma.CMAEvolutionStrategy(np.zeros(len(self._free)), 1.0, options)
         self._asked: list[np.ndarray] = []
 
     def ask(self) -> Float[np.ndarray, "B P"]:
-        """The next generation."""
+        """Return the candidates of the next generation."""
         self._asked = self._strategy.ask()
         return self._full(np.array(self._asked))
 
     def tell(self, losses: Float[np.ndarray, "B"]) -> None:
-        """Losses of the generation that was asked for last; infinite ones count as very bad."""
+        """Pass the losses of the last generation. Infinite losses count as very bad."""
         self._strategy.tell(self._asked, np.nan_to_num(losses, nan=1e9, posinf=1e9).tolist())
 
     @property
     def mean(self) -> Float[np.ndarray, "P"]:
-        """The centre of the distribution."""
+        """The mean of the distribution."""
         return self._full(np.asarray(self._strategy.mean)[None])[0]
 
     @property
     def sigma(self) -> float:
-        """The overall step, 1 at the beginning."""
+        """The overall step size, 1 at the beginning."""
         return float(self._strategy.sigma)
 
     def _full(self, short: np.ndarray) -> np.ndarray:
@@ -125,10 +125,11 @@ class GaussNewtonState:
 
     Attributes:
         params: the best scene so far.
-        losses: `photometric_loss` of each object's windows, and last that of the whole images if the light is searched.
-        normals: Gauss-Newton's matrices of the summed losses, one for each object and one for the light; zero where
-            nothing was searched [1 / unit^2].
-        dampings: to go on with, one for each block.
+        losses: `photometric_loss` of each object's windows. If the light is searched, the last entry is the loss of the
+            whole images.
+        normals: Gauss-Newton's matrices of the summed losses, one for each object and one for the light [1 / unit^2];
+            zero if nothing was searched.
+        dampings: dampings of the next iteration, one for each block.
     """
 
     params: SceneParameters
@@ -138,13 +139,13 @@ class GaussNewtonState:
 
     @staticmethod
     def at(params: SceneParameters) -> GaussNewtonState:
-        """Before the first iteration."""
+        """Return the state before the first iteration."""
         count = len(params.names)
         normals = (*(np.zeros((POSE, POSE)) for _ in range(count)), np.zeros((LIGHT, LIGHT)))
         return GaussNewtonState(params, np.full(count + 1, np.inf), normals, (_FIRST_DAMPING,) * (count + 1))
 
     def undamped(self) -> GaussNewtonState:
-        """The same iterate with the first dampings: those of another place or of other images do not apply."""
+        """Return the same iterate with the initial dampings, for another place or other images."""
         return replace(self, dampings=(_FIRST_DAMPING,) * len(self.dampings))
 
 
@@ -159,17 +160,17 @@ def gauss_newton(
     numbers: Sequence[int] = range(POSE),
     until_settled: bool = False,
 ) -> Iterator[GaussNewtonState]:
-    """Minimise the photometric loss; yields after each sweep over the objects and the light.
+    """Minimise the photometric loss; yield after each sweep over the objects and the light.
 
     Args:
-        models: fields.
-        views: what was observed.
-        start: where to begin.
-        iterations: sweeps.
-        objects: which objects may move; all by default.
-        light: images in which to search the light, coarse ones will do; None holds it.
-        numbers: which of an object's six numbers may change, all by default; `PLANAR_PARAMETERS` keep it flat.
-        until_settled: stop when a sweep hardly lowers the objects' losses.
+        models: models of the objects and the table.
+        views: the images.
+        start: initial state.
+        iterations: largest number of sweeps.
+        objects: indices of the objects that may move; all by default.
+        light: images to search the light in, which may be coarse; None to hold the light.
+        numbers: indices of an object's six numbers that may change; all by default. `PLANAR_PARAMETERS` keeps it flat.
+        until_settled: whether to stop when a sweep hardly lowers the objects' losses.
 
     Yields:
         The iterate after each sweep.
@@ -229,11 +230,11 @@ def _damped_step(
 
 
 def difference_steps(count: int) -> Float[np.ndarray, "P"]:
-    """Half the width of the central differences of each parameter, for a scene of `count` objects."""
+    """Return half the width of the central differences of each parameter, for a scene of `count` objects."""
     return np.array([*([_SHIFT_M] * 3 + [_TURN_RAD] * (POSE - 3)) * count, *[_LIGHT_RAD] * LIGHT])
 
 
-# Where to begin: positions from the masks, and every way an object can lie, ranked by the masked loss.
+# Initial poses: positions from the masks and all resting orientations, ranked by the masked loss.
 
 
 OVERHEAD = np.array([0.0, 0.0, 1.0])
@@ -246,7 +247,7 @@ _DISTINCT_RAD = np.deg2rad(25.0)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RankedPoses:
-    """Poses of one object from which a search may start, the best first.
+    """Initial poses of one object, the best first.
 
     Attributes:
         poses: K poses `T_world_object`.
@@ -257,13 +258,13 @@ class RankedPoses:
     losses: Float[np.ndarray, "K"]
 
     def distinct(self, count: int) -> RankedPoses:
-        """The best `count` whose orientations differ by more than 25 degrees from better ones."""
+        """Return the best `count` poses whose orientations differ by more than 25 degrees from better ones."""
         kept = distinct_orientations(self.poses.quaternion, count, _DISTINCT_RAD)
         return RankedPoses(self.poses[kept], self.losses[kept])
 
 
 def distinct_orientations(quaternions: Float[np.ndarray, "K 4"], count: int, apart_rad: float) -> list[int]:
-    """Return numbers of the first `count` orientations that are more than `apart_rad` from all kept before."""
+    """Return indices of the first `count` orientations that are more than `apart_rad` from all kept before."""
     kept: list[int] = []
     for k in range(len(quaternions)):
         if all(rotation_angle(quaternions[k], quaternions[other]) > apart_rad for other in kept):
@@ -274,13 +275,13 @@ def distinct_orientations(quaternions: Float[np.ndarray, "K 4"], count: int, apa
 
 
 def initial_poses(models: ObjectModels, name: str, part: ObjectView) -> RankedPoses:
-    """Every way the object can lie, put where the masks are, ranked by the masked loss.
+    """Return all resting orientations of an object at the position of its masks, ranked by the masked loss.
 
-    Rendered under a light from overhead of unknown brightness, since the true one is not known yet.
+    They are rendered under a light overhead of unknown brightness, since the true light is not known yet.
 
     Args:
-        models: fields.
-        name: of the object.
+        models: models of the objects and the table.
+        name: name of the object.
         part: windows around its masks.
     """
     poses = _poses_along_rays(part, models.resting(name))
@@ -302,8 +303,8 @@ def rank_poses(
     """Sort poses by their masked loss, the best first.
 
     Args:
-        models: fields.
-        name: of the object.
+        models: models of the objects and the table.
+        name: name of the object.
         part: windows around its masks.
         poses: a batch of `T_world_object`.
         light: unit vector toward the light.
@@ -315,9 +316,9 @@ def rank_poses(
 
 
 def _poses_along_rays(part: ObjectView, resting: RestingOrientations) -> Pose:
-    """Put resting orientations where the centre of mass is closest to the rays through the masks' centroids.
+    """Place resting orientations so that the centre of mass is closest to the rays through the masks' centroids.
 
-    Its height over the table is nearly given by how the object lies, so one view is enough.
+    The orientation nearly determines the height over the table, so that one view is enough.
     """
     normal, target = np.zeros((3, 3)), np.zeros(3)
     for camera, mask, weight in zip(part.cameras, part.mask, np.sqrt(part.area / part.area.max()), strict=True):
@@ -355,7 +356,7 @@ def _centre_on_mask(
 
 
 def _centroids(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids (x, y) of images [px], and the sums of their pixels."""
+    """Return the centroids (x, y) of images [px], and the sums of their pixels."""
     rows, columns = np.mgrid[: weights.shape[-2], : weights.shape[-1]] + 0.5
     total = weights.sum(axis=(-2, -1))
     moments = np.stack([(weights * columns).sum(axis=(-2, -1)), (weights * rows).sum(axis=(-2, -1))], axis=-1)
@@ -363,7 +364,7 @@ def _centroids(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _projection_slope(camera: Camera, points: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B 2 3"]:
-    """Derivatives of pixel coordinates by a point in the world [px / m]."""
+    """Return the derivatives of pixel coordinates by a point in the world [px / m]."""
     inverse = camera.T_world_camera.inverse().matrix()
     x, y, z = (points @ inverse[:3, :3].T + inverse[:3, 3]).T
     z = np.maximum(z, 1e-3)
@@ -375,25 +376,25 @@ def _projection_slope(camera: Camera, points: Float[np.ndarray, "B 3"]) -> Float
 
 # CMA-ES over poses: of one object by the masked loss (paper eq. 5), of scenes by the photometric loss (eq. 6).
 #
-# They are two because an object in its masks is searched from several starts at once, side by side with the other
-# objects, while a scene is searched around one guess, which counts as a candidate: the result is never worse.
+# There are two searches. An object within its masks is searched from several starts at once. A scene is searched around
+# one guess, which is a candidate of each generation, so that the result is never worse.
 
 
 SHIFT_M, TURN_RAD = 4e-3, 0.12  # the first spread
 
 
 class MultistartCMA:
-    """One CMA-ES by the masked loss for each start of an object; a generation of all is rendered as one batch.
+    """One CMA-ES by the masked loss for each start of an object. One generation of all is rendered as one batch.
 
     Args:
-        models: fields.
-        name: of the object.
-        part: where it was observed.
-        starts: where to begin.
+        models: models of the objects and the table.
+        name: name of the object.
+        part: windows around its masks.
+        starts: initial poses.
         light: unit vector toward the light.
         population: candidates per generation and start.
-        rng: of the searches.
-        any_brightness: the light is not known yet, see `masked_loss`.
+        rng: random generator of the searches.
+        any_brightness: whether the light is not known yet, see `masked_loss`.
     """
 
     def __init__(
@@ -417,11 +418,11 @@ class MultistartCMA:
 
     @property
     def sigma(self) -> float:
-        """Step of the first start's search, 1 at the beginning."""
+        """Step size of the first start's search, 1 at the beginning."""
         return self._searches[0].sigma
 
     def advance(self) -> tuple[Pose, float]:
-        """Try one more generation of every search; return its candidates, and the loss of the best."""
+        """Evaluate one more generation of every search; return its candidates, and the loss of the best."""
         batches = [g.perturbed(s.ask()) for g, s in zip(self._guesses, self._searches, strict=True)]
         tried = Pose.joined(*(Pose(b.positions[:, 0], b.quaternions[:, 0]) for b in batches))
         look = render_poses(self._models, self._name, self._part, tried, self._light)
@@ -431,7 +432,7 @@ class MultistartCMA:
         return tried, float(losses.min())
 
     def best_poses(self) -> Pose:
-        """The starts, and the mean of each search."""
+        """Return the starts, and the mean of each search."""
         now = [g.updated(s.mean) for g, s in zip(self._guesses, self._searches, strict=True)]
         return Pose.joined(self._starts, *(Pose(g.positions, g.quaternions) for g in now))
 
@@ -441,11 +442,11 @@ class SceneGeneration:
     """One generation of a search for a scene.
 
     Attributes:
-        best: the best scene so far, and
+        best: the best scene so far.
         loss: its photometric loss.
         tried: poses of the C candidates, a batch for each object.
-        lights: directions toward the light of the candidates.
-        sigma: the search's overall step, 1 at the beginning.
+        lights: unit vectors toward the light of the candidates.
+        sigma: overall step size of the search, 1 at the beginning.
     """
 
     best: SceneParameters
@@ -468,13 +469,13 @@ def search_scene(
     """Minimise the photometric loss around a guess by CMA-ES.
 
     Args:
-        models: fields.
-        views: what was observed, whole images or windows.
-        start: the guess; it is a candidate of every generation.
-        scales: first standard deviation of each number of the parameter vector; 0 holds a number still.
+        models: models of the objects and the table.
+        views: whole images or windows.
+        start: the guess, which is a candidate of every generation.
+        scales: initial standard deviation of each number of the parameter vector; 0 holds a number fixed.
         population: candidates per generation, besides the guess.
-        generations: how many.
-        rng: of the search.
+        generations: number of generations.
+        rng: random generator of the search.
 
     Yields:
         Each generation.
@@ -519,13 +520,13 @@ def search_light(
     """Find the light under which a rendering of the guessed poses fits the images best.
 
     Args:
-        models: fields.
+        models: models of the objects and the table.
         coarse: images to try the whole hemisphere on.
         fine: images to refine on.
-        params: objects and pusher; its light plays no part.
+        params: objects and pusher. The light is ignored.
 
     Returns:
-        The unit vector toward it.
+        The unit vector toward the light.
     """
     directions = np.concatenate([hemisphere(), _ring(models, fine)])
     best = directions[np.argsort(_losses(models, coarse, params, directions))[:_FIRST_SURVIVORS]]
@@ -538,12 +539,12 @@ def search_light(
 
 
 def light_loss_ratio(models: ObjectModels, views: ObservedViews, params: SceneParameters) -> float:
-    """Least truncated error on the grid over the hemisphere, divided by the error under the guess's own light.
+    """Return the least truncated error on the grid over the hemisphere, divided by the error under the guess's light.
 
     Args:
-        models: fields.
-        views: images to compare with; coarse ones will do.
-        params: the guess.
+        models: models of the objects and the table.
+        views: images to compare with, which may be coarse.
+        params: guess of the scene.
     """
     directions = np.concatenate([params.light[None], hemisphere()])
     losses = _losses(models, views, params, directions)
@@ -557,7 +558,7 @@ def hemisphere(count: int = _DIRECTIONS) -> Float[np.ndarray, "K 3"]:
 
 
 def _ring(models: ObjectModels, views: ObservedViews) -> Float[np.ndarray, "K 3"]:
-    """Return directions from all around at the elevation of the table's lit pixels; none where none is seen."""
+    """Return directions from all around at the elevation of the table's lit pixels; none if no lit pixel is visible."""
     level = lit_table_level(models, views)
     if level is None:
         return np.zeros((0, 3))
@@ -571,9 +572,9 @@ def light_neighbours(params: SceneParameters, light: Float[np.ndarray, "3"], ste
     """Return a direction toward the light and eight around it, `step` [rad] apart.
 
     Args:
-        params: any scene, of which only the size of the parameter vector plays a part.
+        params: a scene, of which only the size of the parameter vector is used.
         light: the direction in the middle, a unit vector.
-        step: of the grid [rad].
+        step: step of the grid [rad].
     """
     changes = np.zeros((len(_NEIGHBOUR_OFFSETS), params.size))
     changes[:, -LIGHT:] = step * _NEIGHBOUR_OFFSETS
@@ -591,15 +592,15 @@ def _losses(
 def table_light(
     models: ObjectModels, views: ObservedViews
 ) -> tuple[Float[np.ndarray, "V h w"], Float[np.ndarray, "V h w"], Bool[np.ndarray, "V h w"]]:
-    """Fit the light on the table to each pixel, as if every pixel showed it.
+    """Fit the light on the table to each pixel, as if every pixel showed the table.
 
     Args:
-        models: of which the table is used.
-        views: pictures.
+        models: models, of which only the table is used.
+        views: the images.
 
     Returns:
-        x by which the pixel's radiance is best explained, the error of its colours that this leaves [radiance], and
-        whether the table would be seen if it were empty.
+        The light x that explains each pixel best, the remaining error of its colours [radiance], and whether the pixel
+        would show the table if the table were empty.
     """
     empty = models.together.render(empty_scene(OVERHEAD), views.cameras, quality=QUALITY, outputs={"rgb", "depth"})
     assert empty.depth is not None
@@ -612,14 +613,14 @@ def table_light(
 
 
 def lit_table_level(models: ObjectModels, views: ObservedViews) -> float | None:
-    """Measure the light x = sin(elevation) on the table where the lamp reaches it: the median over its pixels.
+    """Return the light x = sin(elevation) on the lit part of the table: the median over its pixels.
 
     Args:
-        models: of which the table is used.
-        views: pictures; masks play no part.
+        models: models, of which only the table is used.
+        views: the images. Masks are ignored.
 
     Returns:
-        x, or None where too little of a lit table is seen.
+        x, or None if too little of the lit table is visible.
     """
     x, error, on_table = table_light(models, views)
     lit = x[on_table & (error < TABLE_COLOUR) & (x > _LIT)]
@@ -633,7 +634,7 @@ class StepReporter:
     """Builds the steps of one estimation and counts them.
 
     Args:
-        total: steps that are expected; may grow.
+        total: expected number of steps, which may grow.
     """
 
     def __init__(self, total: int) -> None:
@@ -653,14 +654,14 @@ class StepReporter:
         """Build the next step.
 
         Args:
-            stage: which part of the method is at work.
-            note: what it does, for a person.
+            stage: the part of the method that is running.
+            note: what it does, for people.
             params: the best scene so far.
-            tried: poses of each object; shown if there are some of every object, as many as of the fewest.
-            losses: of each object.
-            sigma: the search's overall step.
-            lights: directions that were tried.
-            loss: of the whole.
+            tried: poses of each object that were tried. They are shown if every object has some.
+            losses: losses of each object.
+            sigma: overall step size of the search.
+            lights: unit vectors toward the lights that were tried.
+            loss: loss of the whole.
         """
         self.done = min(self.done + 1, self.total)
         candidates = None
@@ -674,13 +675,13 @@ class StepReporter:
         return EstimateStep(progress, stage, params.state(), candidates, lights, sigma, tuple(losses), loss)
 
     def refinement(self, note: str, at: GaussNewtonState, stage: Stage = "polish") -> EstimateStep:
-        """Build the next step from where Gauss-Newton is."""
+        """Build the next step from a state of Gauss-Newton."""
         return self.step(stage, note, at.params, losses=at.losses[:-1].tolist(), loss=float(at.losses[-1]))
 
     def refinements(
         self, note: str, at: GaussNewtonState, sweeps: Iterator[GaussNewtonState]
     ) -> Generator[EstimateStep, None, GaussNewtonState]:
-        """Build a step from each sweep of Gauss-Newton that began at `at`; return where it ended."""
+        """Yield a step for each sweep of Gauss-Newton that began at `at`; return the last state."""
         for sweep in sweeps:
             at = sweep
             yield self.refinement(note, at)

@@ -1,4 +1,4 @@
-"""Results of estimators and of checks of a photo's content; apart from them, so that importing it loads no model."""
+"""Results of estimators and of checks of a photo's content. Importing this module loads no model."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ Stage = Literal["orientations", "light", "objects", "together", "polish", "done"
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EstimateStep:
-    """One iteration.
+    """One iteration of an estimator.
 
     Attributes:
-        progress: how far the work is.
-        stage: which part of the method is at work.
+        progress: how far the work has come.
+        stage: the part of the method that is running.
         state: the best scene so far.
-        candidates: poses that were tried, C for each of N objects; (C, N) batches.
-        lights: directions toward the light that were tried, C x 3; None while it is held.
-        sigma: the search's overall step, 1 when a stage begins.
-        losses: of each object, in the units of the stage.
-        loss: of the whole, likewise.
-        estimate: the result; only in the last step.
-        image_model: with it, of pictures that fields were not made for; None for usual pictures.
+        candidates: poses `T_world_object` that were tried, a batch of (C, N): C candidates for each of N objects.
+        lights: unit vectors toward the lights that were tried; None while the light is held.
+        sigma: overall step size of the search, relative to the beginning of the stage.
+        losses: loss of each object, in the units of the stage.
+        loss: loss of the whole scene, in the units of the stage.
+        estimate: the result; None before the last step.
+        image_model: exposure, encoding, ambient light and table colour of the images. Only in the last step, and None
+            if they are the usual ones.
     """
 
     progress: Progress
@@ -48,7 +49,7 @@ class EstimateStep:
 
 
 def all_but_last(steps: Iterator[EstimateStep]) -> Generator[EstimateStep, None, EstimateStep]:
-    """Pass on the steps of an estimate but for the last one, which is returned."""
+    """Yield all steps of an estimate but the last one, and return that."""
     before = next(steps)
     for step in steps:
         yield before
@@ -64,11 +65,12 @@ class ContentCheck:
     """Result of a check of a photo's content.
 
     Attributes:
-        verdict: "shown" if the objects are in it, "doubtful" if they may be, "others" if something else is, "bare" if
-            nothing stands out from the table, "elsewhere" if it does not show the table as its camera would.
-        colours: share of the photo's colours that are the objects', times the share of theirs that is found in it.
-        template: log of the factor by which the photometric loss grows without the object that is seen best; 0
-            where the colours sufficed, or the photo shows no such table.
+        verdict: "shown" if the photo shows the objects, "doubtful" if it may, "others" if it shows something else,
+            "bare" if nothing stands out from the table, "elsewhere" if it does not show the table as its camera would.
+        colours: share of the photo's colours that belong to the objects, times the share of the objects' colours that
+            the photo has.
+        template: log of the factor by which the photometric loss grows without the object that is seen best. It is 0
+            if the colours were enough to decide, or the photo does not show the table.
     """
 
     verdict: Verdict

@@ -1,9 +1,9 @@
-"""Later frames: no masks, started from the last estimate or from a predicted state (paper section 4.2, last part).
+"""Estimates from later frames, without masks, starting at an expected state (paper section 4.2, last part).
 
-Objects whose photometric residual stays small are refined by Gauss-Newton from where they were expected. The others are
-searched in order of cost: along the pusher's motion (`push_hypotheses`), by CMA-ES with a small spread, and in their
-other resting orientations. Fine images decide about yaw, since coarse ones do not resolve labels. The light is held
-unless the table's own residual grows and another light lowers it: then the lamp was moved and is searched again.
+Objects with a small photometric residual at their expected poses are refined by Gauss-Newton. The others are searched,
+with cheap searches first: along the pusher's motion (`push_hypotheses`), by CMA-ES with a small spread, and in their
+other resting orientations. Fine images decide about yaw, since coarse images do not resolve labels. The light is held.
+It is searched again only if the residual of the table grows and another light lowers it, that is, if the lamp moved.
 """
 
 from __future__ import annotations
@@ -55,25 +55,26 @@ from osfcore.geometry.states import Observation, SceneState
 
 @dataclass(frozen=True, slots=True)
 class TrackingConfig:
-    """How a later frame is estimated.
+    """Settings of `estimate_next`. A residual is a root mean square error over an object's pixels [radiance].
 
     Attributes:
-        stays_below: residual of an object [radiance] up to which it counts as standing where it was expected.
-        fits_below: the same for one that was found anew: then it may fit better.
-        fits_finely_below: the same in images of full resolution, in which what is right fits better.
-        lamp_above: residual of everything but the objects [radiance] from which the lamp may have moved.
-        lamp_hint: share of the loss to which the best of few other lights must lower it before more are tried.
-        lamp_gain: share of the loss to which another light must lower it to be believed.
-        rough_sweeps: of the descent over objects that moved, first in images of a quarter of the resolution,
-        sweeps: then of half of it,
-        fine_sweeps: then of that with more rays a pixel,
-        closest_sweeps: and of full resolution for those that do not fit in it.
-        population: candidates per generation of the search for objects that do not fit.
-        generations: of that search.
-        shift: its spread [m].
-        turn: its spread about the vertical [rad]; a quarter of it about other axes.
-        turned_within: loss of an object turned about the vertical, over its own, up to which it may be turned wrongly.
-        reach: how far around an object's expected place images are looked at [m].
+        stays_below: largest residual of an object that counts as being where it was expected.
+        fits_below: largest residual of an object that was searched and counts as found.
+        fits_finely_below: the same in images of full resolution.
+        lamp_above: residual of all other pixels above which the lamp may have moved.
+        lamp_hint: share of the loss that the best of a few other lights must reach before more lights are tried.
+        lamp_gain: share of the loss that another light must reach to be accepted.
+        rough_sweeps: sweeps of Gauss-Newton over the objects that moved, at a quarter of the resolution.
+        sweeps: sweeps at half the resolution.
+        fine_sweeps: sweeps at half the resolution with more rays per pixel.
+        closest_sweeps: sweeps at full resolution, over objects that do not fit there.
+        population: population of CMA-ES for objects that do not fit.
+        generations: its generations.
+        shift: its initial standard deviation of positions [m].
+        turn: its initial standard deviation about the vertical [rad]; a quarter of it about other axes.
+        turned_within: ratio of the loss of an object turned about the vertical to its own loss, below which the object
+            may be turned wrongly.
+        reach: margin around an object's expected position in which images are compared [m].
     """
 
     stays_below: float = 0.05
@@ -102,19 +103,28 @@ def estimate_next(
     config: TrackingConfig | None = None,
     usual: Float[np.ndarray, "N"] | None = None,
 ) -> Iterator[EstimateStep]:
-    """Find poses again; the last step holds the estimate.
+    """Estimate poses, and the light if it moved, in images that follow an earlier estimate.
 
     Args:
-        models: fields of the objects and the table.
-        observation: one or more views; masks play no part.
-        expected: the last estimate, or what was predicted from it, with the light as last estimated.
-        rng: of the search.
-        config: how much work to do.
-        usual: residuals that are normal for the observation's objects, see `expected_residuals`; 0 by default.
+        models: models of the objects and the table.
+        observation: one or more views. Masks are ignored.
+        expected: the last estimate, or a prediction from it, with the last estimate of the light.
+        rng: random generator of the search.
+        config: settings.
+        usual: residuals that are normal for these objects [radiance], as
+            `osfcore.estimation.uncertainty.expected_residuals` returns them; 0 by default.
+
+    Returns:
+        Steps of the search. The last one has `estimate`.
 
     Raises:
-        InvalidInput: if the expected state is of other objects.
+        InvalidInput: if the expected state has other objects.
         UnknownName: if an object has no field.
+
+    Example:
+        >>> *_, last = estimate_next(models, observation, state, np.random.default_rng(0))
+        >>> last.estimate.trusted
+        True
     """
     models.check(observation.names)
     if set(expected.names) != set(observation.names):
@@ -184,12 +194,12 @@ class _Tracker:
         yield self._reporter.finish(at, estimate)
 
     def _poorly_fitted(self, params: SceneParameters) -> Bool[np.ndarray, "N"]:
-        """Find the objects whose residual is above what is allowed."""
+        """Return the objects whose residual is larger than allowed."""
         residual = object_residuals(evaluate_fit(self._models, self._middle, params))
         return residual > np.maximum(self._config.fits_below, self._allowed)
 
     def _search_light(self, at: GaussNewtonState) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Search the light with the objects where they were expected; keep it if the loss falls far enough."""
+        """Search the light with all objects at their expected poses; keep it if the loss falls far enough."""
         if light_loss_ratio(self._models, self._rough, at.params) > self._config.lamp_hint:
             return at  # objects that moved are no reason to search on
         params = replace(at.params, light=search_light(self._models, self._rough, self._coarse, at.params))
@@ -204,12 +214,12 @@ class _Tracker:
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
         objects = np.flatnonzero(moving).tolist()
         refined = gauss_newton(self._models, views, at, iterations=sweeps, objects=objects, until_settled=True)
-        return (yield from self._reporter.refinements("The last millimetres", at, refined))
+        return (yield from self._reporter.refinements("Refining all poses", at, refined))
 
     def _try_pushes(
         self, at: GaussNewtonState, misfit: Bool[np.ndarray, "N"]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Take the best of the motions that the push may have caused, for all objects together, then for each alone."""
+        """Choose the best motion that the push may have caused, for all objects together, then for each alone."""
         numbers = np.flatnonzero(misfit).tolist()
         together = joint_push_hypotheses(at.params, numbers, self._push)
         batch = replace(at.params.repeated(len(together)), positions=together)
@@ -221,7 +231,7 @@ class _Tracker:
             losses = pose_losses(self._models, views, at.params, n, tried)
             at = replace(at, params=at.params.with_pose(n, tried[int(losses.argmin())]))
             at = replace(at, params=self._best_rolling_pose(at.params, n))
-            yield self._reporter.refinement(f"{at.params.names[n]}: where it was pushed", at, "together")
+            yield self._reporter.refinement(f"{at.params.names[n]}: along the push", at, "together")
         return at
 
     def _search(
@@ -237,7 +247,7 @@ class _Tracker:
                 self._models, views, at.params, scales,
                 population=e.population, generations=e.generations, rng=self._rng,
             )  # fmt: skip
-            losses, note = at.losses[:-1].tolist(), f"{at.params.names[n]}: where it went"
+            losses, note = at.losses[:-1].tolist(), f"{at.params.names[n]}: near its expected pose"
             for found in search:
                 at = replace(at, params=found.best)
                 yield self._reporter.step(
@@ -246,7 +256,7 @@ class _Tracker:
         return at
 
     def _best_rolling_pose(self, params: SceneParameters, n: int) -> SceneParameters:
-        """The guess with an object turned by the rolling angle of the lowest loss; how far it slipped is unknown."""
+        """Return the guess with an object rolled by the angle of the lowest loss. Slip while rolling is unknown."""
         tried = rolling_hypotheses(self._models, params, n, self._push)
         if len(tried.position) == 1:
             return params
@@ -256,17 +266,17 @@ class _Tracker:
     def _recover(
         self, at: GaussNewtonState, misfit: Bool[np.ndarray, "N"]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Try all resting orientations of poorly fitted objects, at their present and at their expected position."""
+        """Try all resting orientations of poorly fitted objects, at their present and their expected positions."""
         for n in np.flatnonzero(misfit).tolist():
             others = Pose.joined(*(resting_hypotheses(self._models, one, n) for one in (at.params, self._initial)))
             at = self._compare_orientations(at, n, others)
-            yield self._reporter.refinement(f"{at.params.names[n]}: lying in another way", at, "together")
+            yield self._reporter.refinement(f"{at.params.names[n]}: other resting orientations", at, "together")
         return at
 
     def _refine_finely(
         self, at: GaussNewtonState, moved: Bool[np.ndarray, "N"]
     ) -> Iterator[EstimateStep]:  # returns a GaussNewtonState
-        """Refine what does not fit in fine images; compare orientations of what still does not, or has moved."""
+        """Refine objects that do not fit, in fine images; compare orientations of those that still do not, or moved."""
         bad = self._poorly_fitted_finely(at.params)
         if bad.any():
             at = yield from self._refine(at, bad, self._fine, self._config.closest_sweeps)
@@ -276,20 +286,20 @@ class _Tracker:
             if bad[n] or self._may_be_turned(at.params, n, others):
                 others = Pose.joined(others, resting_hypotheses(self._models, at.params, n))
                 at = self._compare_orientations(at, n, others)
-                yield self._reporter.refinement(f"{at.params.names[n]}: the other way round", at, "together")
+                yield self._reporter.refinement(f"{at.params.names[n]}: turned around", at, "together")
         return at
 
     def _poorly_fitted_finely(self, params: SceneParameters) -> Bool[np.ndarray, "N"]:
         return object_residuals(self._fit_finely(params)) > np.maximum(self._config.fits_finely_below, self._allowed)
 
     def _fit_finely(self, params: SceneParameters) -> FitQuality:
-        """The fit in fine images; rendered again only for another guess."""
+        """Return the fit in fine images. It is rendered again only if the guess has changed."""
         if self._last_fit is None or self._last_fit[0] is not params:
             self._last_fit = params, evaluate_fit(self._models, self._fine, params)
         return self._last_fit[1]
 
     def _may_be_turned(self, params: SceneParameters, n: int, others: Pose) -> bool:
-        """Decide whether the loss of some other yaw is within a factor of the present one's."""
+        """Return whether another yaw has a loss within a factor of the present one."""
         views = crop_to_silhouette(self._sharp, self._models, params, n)
         here, *there = pose_losses(self._models, views, params, n, Pose.joined(params.state().poses[n][None], others))
         return min(there) < self._config.turned_within * here
@@ -299,11 +309,11 @@ class _Tracker:
         return at
 
 
-# Motion hypotheses: poses that an object may have after a push, as starts of a search; their photometric loss
-# decides.
+# Motion hypotheses: poses that an object may have after a push. Searches start from them, and the photometric loss
+# decides between them.
 #
-# An object moves by a share of the pusher's motion, alone or with others, and keeps its orientation, turns about
-# the vertical, or rolls without slipping. Fast and deliberately coarse: not a dynamics model.
+# An object moves by a share of the pusher's motion, alone or with others. It keeps its orientation, turns about the
+# vertical, or rolls without slipping. This is fast and deliberately coarse; it is no dynamics model.
 
 
 _SHARES = (0.0, 0.5, 1.0)  # of the push, by which each of several objects may have moved
@@ -323,11 +333,12 @@ _ROLLING_RAD = np.deg2rad(15.0)  # from an orientation in which it can lie
 def joint_push_hypotheses(
     params: SceneParameters, numbers: Sequence[int], push: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "K N 3"]:
-    """Positions of all objects if some were moved by shares of a push, K combinations; the first is the guess's [m].
+    """Return positions of all objects [m] after some were moved by shares of a push: K combinations, the guess first.
 
     Args:
-        params: the guess.
-        numbers: of the objects that may have moved; up to four are combined in all ways, more move by one share.
+        params: guess of the scene.
+        numbers: indices of the objects that may have moved; up to four are combined in all ways, more move by one
+            share.
         push: motion of the pusher [m].
     """
     if len(numbers) <= _MAX_COMBINED:
@@ -340,13 +351,13 @@ def joint_push_hypotheses(
 
 
 def push_hypotheses(models: ObjectModels, params: SceneParameters, number: int, push: Float[np.ndarray, "3"]) -> Pose:
-    """Poses of one object on a grid along and across a push, times yaw angles, and rolled; a batch.
+    """Return a batch of poses of one object: on a grid along and across a push, turned by yaw angles, and rolled.
 
     Args:
-        models: fields, for the object's centre of mass and how it can roll.
+        models: models of the objects, for the centre of mass and the ways an object can roll.
         params: the guess, around which the grid lies.
-        number: of the object.
-        push: motion of the pusher [m]; under 5 mm the grid covers about 2 cm around the guess, and nothing rolls.
+        number: index of the object.
+        push: motion of the pusher [m]. Below 5 mm the grid covers about 2 cm around the guess, and nothing rolls.
     """
     length = float(np.linalg.norm(push))
     step = push if length > _MIN_PUSH_M else np.array([_NEAR_M / _ALONG[-1], 0.0, 0.0])
@@ -364,13 +375,13 @@ def push_hypotheses(models: ObjectModels, params: SceneParameters, number: int, 
 def rolling_hypotheses(
     models: ObjectModels, params: SceneParameters, number: int, push: Float[np.ndarray, "3"]
 ) -> Pose:
-    """Poses of one object turned about the axis about which a push rolls it, its own first; a batch.
+    """Return a batch of poses of one object, rolled about the axis about which a push rolls it; its own pose is first.
 
     Args:
-        models: fields, for the object's centre of mass and how it can roll.
-        params: the guess; the object's centre of mass stays.
-        number: of the object.
-        push: motion of the pusher [m]; if it cannot roll the object, only its own pose is returned.
+        models: models of the objects, for the centre of mass and the ways an object can roll.
+        params: the guess. The object's centre of mass stays.
+        number: index of the object.
+        push: motion of the pusher [m]. If it cannot roll the object, only its own pose is returned.
     """
     axis = _rolling_axis(models, params, number, push)
     angles = np.arange(_ROLLS if axis.any() else 1) * 2 * np.pi / _ROLLS
@@ -379,12 +390,12 @@ def rolling_hypotheses(
 
 
 def resting_hypotheses(models: ObjectModels, params: SceneParameters, number: int) -> Pose:
-    """Poses of one object in all its resting orientations; a batch.
+    """Return a batch of poses of one object, in all its resting orientations.
 
     Args:
-        models: fields, for how the object can lie.
-        params: the guess; the centre of mass stays above the same point of the table.
-        number: of the object.
+        models: models of the objects, for the resting orientations.
+        params: the guess. The centre of mass stays above the same point of the table.
+        number: index of the object.
     """
     resting, centre = models.resting(params.names[number]), models.centre_of_mass(params, number)
     centres = np.column_stack([np.tile(centre[:2], (len(resting.heights), 1)), resting.heights])
@@ -394,7 +405,9 @@ def resting_hypotheses(models: ObjectModels, params: SceneParameters, number: in
 def _rolling_axis(
     models: ObjectModels, params: SceneParameters, number: int, push: np.ndarray
 ) -> Float[np.ndarray, "3"]:
-    """Unit vector about which a push rolls a body forward, the one nearest to square to the push; zero if none.
+    """Return the unit vector about which a push rolls a body forward; zero if the push cannot roll it.
+
+    Of several possible axes, it is the one closest to perpendicular to the push.
 
     A body can roll about an axis if it can rest in every orientation on the way.
     """
@@ -414,7 +427,7 @@ def _rolling_axis(
 def _roll_along(
     models: ObjectModels, params: SceneParameters, number: int, axis: np.ndarray, path: np.ndarray
 ) -> Float[np.ndarray, "4"]:
-    """Return the rotation of a body that rolls along a path without slipping, its centre as high as it is now."""
+    """Return the rotation of a body that rolls along a path without slipping, with its centre at its present height."""
     height, radius = models.centre_of_mass(params, number)[2], models.resting(params.names[number]).radius
     forward = np.array([axis[1], -axis[0], 0.0])
     return quaternion_exp(axis * (forward @ path) / max(float(height), 0.25 * radius))

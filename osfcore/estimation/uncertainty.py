@@ -1,8 +1,9 @@
 """Uncertainty of an estimate: standard deviations from Gauss-Newton's normal matrices, doubts from residuals.
 
-The covariance of a block is s^2 (J^T W J)^-1 with s^2 the mean squared residual, inflated by factors that were
-calibrated on other scenes, because errors of neighbouring pixels are correlated and fields err as well. For an object
-s^2 is at most a share of its own mean squared residual: grain of a wooden table says little of how well it is known.
+The covariance of a block is s^2 (J^T W J)^-1, with s^2 the mean squared residual. It is inflated by factors that were
+calibrated on other scenes, because errors of neighbouring pixels are correlated and fields have errors as well. For an
+object, s^2 is at most a share of its own mean squared residual, because the grain of a wooden table does not make the
+object's pose less certain.
 """
 
 from __future__ import annotations
@@ -43,12 +44,12 @@ class FitQuality:
     """How well a rendered guess fits the images.
 
     Attributes:
-        residuals: root of mean square error over the pixels of each object in each view; 0 where it shows in none.
-        pixels: of each object in each view, by its rendered opacity.
+        residuals: root mean square error over the pixels of each object in each view [radiance]; 0 if it has none.
+        pixels: number of pixels of each object in each view: the sum of its rendered opacity.
         contrast: standard deviation of the image over the pixels of each object in all views [radiance].
-        level: root of mean square of the image over the same pixels [radiance].
-        overlap: of rendered silhouettes and masks over all views (intersection over union); 1 without masks.
-        surroundings: root of mean square error over all other pixels.
+        level: root mean square of the image over the same pixels [radiance].
+        overlap: overlap of rendered silhouettes and masks over all views (intersection over union); 1 without masks.
+        surroundings: root mean square error over all other pixels [radiance].
         spread: estimated variance of a pixel's error.
     """
 
@@ -65,9 +66,9 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParame
     """Compare a guess with the images.
 
     Args:
-        models: fields of the objects and the table.
-        views: what was observed; masks, where there are any, give the overlap of silhouettes.
-        params: the guess.
+        models: models of the objects and the table.
+        views: the images. Their masks, if any, give the overlap of silhouettes.
+        params: guess of the scene.
     """
     rendered = models.together.render(
         params.repeated(), views.cameras, quality=views.quality, outputs={"rgb", "opacity"}
@@ -92,53 +93,55 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParame
 
 
 def relative_allowance(fit: FitQuality) -> Float[np.ndarray, "N"]:
-    """Residuals that may be of a right pose, of each object, where masks bear it out: a share of its contrast."""
+    """Return the largest residual of a right pose with masks, for each object [radiance]: a share of its contrast."""
     return np.maximum(MAX_RESIDUAL, _RELATIVE_RESIDUAL * fit.contrast)
 
 
 def object_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
-    """Return the root of the mean square error of each object over its pixels in all views [radiance]."""
+    """Return the root mean square error of each object over its pixels in all views [radiance]."""
     total = np.maximum(fit.pixels.sum(axis=0), 1e-6)
     return np.sqrt((fit.pixels * fit.residuals**2).sum(axis=0) / total)
 
 
 def relative_residuals(fit: FitQuality) -> Float[np.ndarray, "N"]:
-    """Return residuals as shares of the objects' levels: how bright the light is plays no part."""
+    """Return residuals as shares of the objects' levels, which do not depend on the brightness of the light."""
     return object_residuals(fit) / np.maximum(fit.level, 1e-6)
 
 
 def expected_fit(models: ObjectModels, observation: Observation, state: SceneState) -> FitQuality:
-    """Evaluate how well objects fit where they stand: fields err, and what is normal here is no doubt later.
+    """Evaluate how well objects fit at an estimate.
+
+    Fields have errors. A residual that is normal for an object must not raise doubts later.
 
     Args:
-        models: fields of the objects and the table.
-        observation: one or more views; masks play no part.
-        state: what to render, an estimate from this observation; the pusher is the observation's.
+        models: models of the objects and the table.
+        observation: one or more views. Masks are ignored.
+        state: an estimate from this observation, which is rendered. The pusher is that of the observation.
     """
     views = views_of(observation, FINE_SIDE, samples=2)
     return evaluate_fit(models, views, SceneParameters.of(state, observation.pusher))
 
 
 def expected_residuals(models: ObjectModels, observation: Observation, state: SceneState) -> Float[np.ndarray, "N"]:
-    """Return the RMS residual of each object where it stands [radiance], see `expected_fit`."""
+    """Return the root mean square residual of each object at an estimate [radiance], see `expected_fit`."""
     return object_residuals(expected_fit(models, observation, state))
 
 
 def goal_allowance(fit: FitQuality, usual: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    """Residuals beyond which an object is not what a goal image shows there [radiance].
+    """Return the largest residual of each object that counts as found in a goal image [radiance].
 
-    With shares of the level, the light of the goal may be brighter or dimmer than the scene's.
+    It is a share of the object's level, because the light of the goal may be brighter or dimmer than the scene's.
 
     Args:
-        fit: of a guess of the goal image.
-        usual: `relative_residuals` where the objects are now, to the same cameras; not a number where not known.
+        fit: fit of a guess of the goal image.
+        usual: `relative_residuals` of the present scene; NaN if not known.
     """
     shares = np.maximum(_LEAST_SHARE, _SHARE_ALLOWANCE * np.minimum(usual, _MOST_USUAL_SHARE))
     return np.where(np.isnan(usual), MAX_RESIDUAL, np.maximum(_LEAST_RESIDUAL, shares * fit.level))
 
 
 def allowed_residuals(usual: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    """Residuals that are nothing new where `expected_residuals` are usual [radiance]."""
+    """Return the largest residuals that raise no doubt [radiance], given the `expected_residuals`."""
     return _ALLOWANCE * np.minimum(usual, _MOST_USUAL)
 
 
@@ -152,20 +155,17 @@ def estimate_with_uncertainty(
     lowest: Float[np.ndarray, "N"] | None = None,
     allowed: Float[np.ndarray, "N"] | None = None,
 ) -> EstimatedState:
-    """Make an estimate of a guess, with its uncertainty and the doubts about it.
+    """Return an estimate with its uncertainty and the doubts about it.
 
     Args:
-        params: what was found.
+        params: the scene that was found.
         normals: Gauss-Newton's matrices there, one for each object and one for the light.
-        fit: of the guess.
-        rivals: by object, the best loss of a different orientation over the loss of the one chosen. Where all others
-            explain the images far worse, larger residuals are allowed.
-        light_held: the light was given, not searched.
+        fit: fit of the guess.
+        rivals: for each object, ratio of the best loss of a different orientation to the loss of the chosen one. A very
+            large ratio allows larger residuals.
+        light_held: whether the light was given and not searched.
         lowest: height of each object's lowest point [m], if objects can only stand on the table.
-        allowed: residuals up to which an object's images are not doubted; `MAX_RESIDUAL` by default.
-
-    Returns:
-        The estimate.
+        allowed: largest residual of each object that raises no doubt [radiance]; `MAX_RESIDUAL` by default.
     """
     count = len(params.names)
     deviations = _deviations(normals, fit, count)
@@ -188,7 +188,7 @@ def reason_for(names: Sequence[str], doubts: Sequence[str]) -> str:
 
 
 def _deviations(normals: Sequence[np.ndarray], fit: FitQuality, count: int) -> np.ndarray:
-    """Compute standard deviations of all parameters; very large where the images do not constrain one."""
+    """Return standard deviations of all parameters. They are very large if the images do not constrain a parameter."""
     own = np.where(fit.pixels.sum(axis=0) < _MIN_PIXELS, np.inf, _MOST_SPREAD * object_residuals(fit) ** 2)
     spreads = np.append(np.minimum(own, fit.spread), fit.spread)  # s^2 of the objects, and last of the light
     widths, found, start = difference_steps(count), [], 0
@@ -212,7 +212,7 @@ def _reason_for_doubt(
     if rival < _MIN_RIVAL_RATIO:
         return AMBIGUOUS
     if position_std > _MOST_POSITION_STD_M or rotation_std > _MOST_ROTATION_STD_RAD:
-        return f"its pose is known to {1000 * position_std:.0f} mm and {np.rad2deg(rotation_std):.0f} deg only"
+        return f"its pose is uncertain by {1000 * position_std:.0f} mm and {np.rad2deg(rotation_std):.0f} deg"
     if abs(height) > _MAX_HEIGHT_M:
         return f"it would {'float above' if height > 0 else 'sink into'} the table by {1000 * abs(height):.0f} mm"
     return ""
@@ -223,15 +223,15 @@ def _misfit(fit: FitQuality, n: int, most: float) -> str:
         return "it is hardly visible"
     residual = object_residuals(fit)[n]
     if fit.overlap[n] < _MIN_OVERLAP:
-        return f"its silhouette covers its masks by {fit.overlap[n]:.0%} only"
-    return f"its images differ from what was rendered by {residual:.2f}" if residual > most else ""
+        return f"its silhouette and its masks overlap by only {fit.overlap[n]:.0%}"
+    return f"its images differ from the rendering by {residual:.2f}" if residual > most else ""
 
 
 def misfits(fit: FitQuality, allowed: Float[np.ndarray, "N"]) -> list[int]:
-    """Return numbers of the objects that the images do not show where they were rendered.
+    """Return indices of the objects that the images do not show at their rendered poses.
 
     Args:
-        fit: of the guess.
-        allowed: residuals up to which an object's images are not doubted.
+        fit: fit of the guess.
+        allowed: largest residual of each object that raises no doubt [radiance].
     """
     return [n for n in range(len(allowed)) if _misfit(fit, n, allowed[n])]

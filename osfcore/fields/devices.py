@@ -1,4 +1,4 @@
-"""Which device computes, and in how many threads."""
+"""The choice of device and number of threads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from osfcore.errors import InvalidInput
 
 
 def pick_device(name: str) -> torch.device:
-    """Return the device to compute on; "auto" takes a GPU where there is one.
+    """Return a PyTorch device by name; "auto" chooses a GPU if there is one.
 
     Raises:
         InvalidInput: if the name is unknown or there is no such device.
@@ -24,18 +24,18 @@ def pick_device(name: str) -> torch.device:
 
 
 def use_one_thread() -> None:
-    """Let torch work in one thread from now on, for the rollouts of a planner.
+    """Make torch use one thread from now on, for the rollouts of a planner.
 
-    They are thousands of small products: a second thread hardly helps on an idle machine, and where the other core is
-    busy, with a page that draws the 3D view, say, each product waits for it. Renderer and estimator have threads of
-    their own.
+    Rollouts are thousands of small products. A second thread hardly helps on an idle machine. If the other core is
+    busy, such as with the 3D view of a page, each product would wait for it. Renderer and estimator have their own
+    threads.
     """
     torch.set_num_threads(1)
 
 
 @contextmanager
 def computing_threads(count: int) -> Iterator[None]:
-    """Let torch and numba compute in that many threads of the processor, numba in no more than it has."""
+    """Make torch and numba use this many threads; numba at most as many as the processor has."""
     import numba
 
     before = numba.get_num_threads(), torch.get_num_threads()

@@ -1,4 +1,4 @@
-"""Which fields there are: those that ship with the package, and those trained on this machine, which come first."""
+"""The fields on this machine: those trained here come before those that ship with the package."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _MOST_CHARACTERS = 1000
 
 @dataclass(frozen=True, slots=True)
 class FieldInfo:
-    """One field.
+    """Facts about one field.
 
     Attributes:
-        name: of its object.
+        name: name of its object.
         source: "shipped" with the package or "trained" on this machine.
-        path: of its weights.
-        bytes: size of its weights.
-        metrics: what was measured when it was trained, as plain numbers and words; empty if that is not known.
+        path: file of its weights.
+        bytes: size of that file.
+        metrics: measurements from its training, as plain numbers and words; empty if they are not known.
     """
 
     name: str
@@ -44,15 +44,19 @@ class FieldInfo:
 
 
 class FieldLibrary:
-    """The fields of the package and of DATA_DIR/fields/NAME."""
+    """Trained fields on this machine: those in DATA_DIR/fields/NAME, then those that ship with the package.
+
+    Args:
+        data_dir: folder that may hold fields/NAME/field.safetensors and field.json; None for the shipped fields only.
+        shipped: folder with NAME.safetensors and NAME.json; the package's own by default.
+
+    Example:
+        >>> fields = FieldLibrary(None)
+        >>> fields.has("006_mustard_bottle")
+        True
+    """
 
     def __init__(self, data_dir: Path | None, *, shipped: Path | None = None) -> None:
-        """Look into a data directory, or at the shipped fields only.
-
-        Args:
-            data_dir: holds fields/NAME/field.safetensors and field.json; need not exist.
-            shipped: folder with NAME.safetensors and NAME.json; the package's by default.
-        """
         self._trained = None if data_dir is None else data_dir / "fields"
         self._shipped = shipped or Path(str(files("osfcore.fields") / "shipped"))
 
@@ -68,7 +72,7 @@ class FieldLibrary:
         return self._trained, self._shipped
 
     def stamp(self, name: str) -> tuple[int, int] | None:
-        """Return what changes when a field is trained, trained again or deleted; None for a shipped one."""
+        """Return a value that changes when the field is trained or deleted; None for a shipped field."""
         if self._trained is None:
             return None
         try:
@@ -78,7 +82,7 @@ class FieldLibrary:
         return status.st_mtime_ns, status.st_size
 
     def folder(self, name: str) -> Path:
-        """Return the folder where a trained field of that name belongs.
+        """Return the folder that a trained field of this name belongs in.
 
         Raises:
             UnknownName: if this library has no data directory.
@@ -88,7 +92,7 @@ class FieldLibrary:
         return self._trained / name
 
     def names(self) -> tuple[str, ...]:
-        """Return all objects with a field, in order of name."""
+        """Return the names of all objects with a field, sorted."""
         shipped = {path.stem for path in self._shipped.glob(f"*{_SUFFIX}")} - {TABLE_NAME}
         trained = set()
         if self._trained is not None and self._trained.is_dir():
@@ -100,10 +104,10 @@ class FieldLibrary:
         return name in self.names()
 
     def info(self, name: str) -> FieldInfo:
-        """Return what is known of a field without loading it.
+        """Return facts about a field without loading it.
 
         Raises:
-            UnknownName: if there is none of that name.
+            UnknownName: if the object has no field.
         """
         if not self.has(name):
             raise UnknownName("field", name, self.names())
@@ -120,16 +124,16 @@ class FieldLibrary:
         return FieldInfo(name, "shipped", path, path.stat().st_size, _metrics(path.with_suffix(".json")))
 
     def load(self, name: str) -> KiloOSF:
-        """Read a field.
+        """Load the field of an object.
 
         Raises:
-            UnknownName: if there is none of that name.
+            UnknownName: if the object has no field.
             CorruptFile: if its file is broken.
         """
         return read_field(self.info(name).path)
 
     def load_table(self) -> TableField:
-        """Read the table: one placed in DATA_DIR/fields/table comes before the shipped one.
+        """Load the field of the table: that in DATA_DIR/fields/table, or else the shipped one.
 
         Raises:
             CorruptFile: if its file is broken.

@@ -1,12 +1,12 @@
 """Objects with hollows that no silhouette shows, such as bowls: the visual hull is opened, and its voxels are fitted.
 
-A point of a surface has one colour and one normal, whoever looks at it: under all views and lights its brightness is
-that of Lambert's law, or the ambient part of it in shadow. A point of a lid shows each view another point of the inside
-behind it, for which no colour and normal can be found. So every voxel of the hull's surface gets the normal that
-explains best what is seen of it, and what no normal explains is opened (Kutulakos and Seitz's photo-consistency,
-with the light known). The hull holds the object: whatever it leaves in view or in the light truly is.
+The visual hull closes a bowl with a lid. A true surface point has one colour and one normal for all views: its
+brightness follows Lambert's law, or is the ambient part of it in shadow. A point of a lid shows each view another point
+of the inside, so that no colour and normal explain it. Each voxel of the hull's surface gets the normal that explains
+its images best, and voxels that no normal explains are removed (photo-consistency of Kutulakos and Seitz, with known
+light). The object lies within the hull, so that points which the hull leaves visible or lit are truly visible or lit.
 
-What is left is fitted to the images by descent on the voxels alone, without networks.
+The remaining voxels are fitted to the images by descent, without networks.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 def open_hollows(field: KiloOSF, images: ImageSet, *, fog_g: float) -> KiloOSF:
-    """Keep of a solid hull a layer under the part of its surface on which views agree, with fog around it.
+    """Keep a layer of a solid hull under the surface on which the views agree, with fog around it.
 
     Args:
         field: a solid visual hull.
         images: the views.
-        fog_g: density feature of the fog, from which edges grow back that were opened wrongly.
+        fog_g: density feature of the fog, from which wrongly removed edges can grow again.
     """
     solid = field.density > 0
     misfit = surface_misfit(field, images, solid)
@@ -71,12 +71,12 @@ def open_hollows(field: KiloOSF, images: ImageSet, *, fog_g: float) -> KiloOSF:
 
 
 def without_fog(field: KiloOSF) -> KiloOSF:
-    """Leave out the corners that are neither opaque nor next to one that is: they can never become so again."""
+    """Remove corners that are neither opaque nor next to an opaque corner."""
     return reshelled(field, np.asarray(ndimage.binary_dilation(field.density > _OPAQUE_G), bool) & (field.index > 0))
 
 
 def _largest(mask: Bool[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "nx ny nz"]:
-    """Return the largest piece, over small gaps: an object is one piece, but the middle of a lid may float."""
+    """Return the largest connected piece, across small gaps. It removes floating remains of lids."""
     joined = np.asarray(ndimage.binary_dilation(mask, np.ones((3, 3, 3)), iterations=_GAP_VOXELS))
     pieces = np.zeros(mask.shape, np.int32)
     if not ndimage.label(joined, output=pieces):
@@ -87,18 +87,18 @@ def _largest(mask: Bool[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "nx ny nz"]
 def surface_misfit(
     field: KiloOSF, images: ImageSet, solid: Bool[np.ndarray, "nx ny nz"]
 ) -> Float32[np.ndarray, "nx ny nz"]:
-    """Measure how badly the best Lambertian point explains what views see of each voxel of a surface.
+    """Return how badly the best Lambertian point explains the images of each voxel of a surface.
 
-    It is the robust mean over views of e^2 / (1 + e^2), with e the difference of brightness in tolerances: 0 where all
-    agree, 1 where nothing does.
+    It is the robust mean over views of e^2 / (1 + e^2), with e the difference of brightness in units of the tolerance:
+    0 if all views agree, 1 if none does.
 
     Args:
-        field: gives the grid.
+        field: field whose grid is used.
         images: the views.
-        solid: corners of the grid that hold the object.
+        solid: corners of the grid inside the object.
 
     Returns:
-        NaN inside, outside, and where too few views look.
+        The misfit of each corner; NaN inside, outside, and where too few views see the surface.
     """
     points = np.argwhere(solid & ~np.asarray(ndimage.binary_erosion(solid), bool))
     cameras = images.cameras
@@ -119,7 +119,7 @@ def surface_misfit(
 
 @numba.njit(fastmath=True, error_model="numpy")
 def _is_blocked(solid, x, y, z, dx, dy, dz):
-    """Return whether something solid stands in the way from a voxel into a direction."""
+    """Return whether something solid blocks the way from a voxel in a direction."""
     nx, ny, nz = solid.shape
     t = _CLEAR_VOXELS
     while True:
@@ -133,7 +133,7 @@ def _is_blocked(solid, x, y, z, dx, dy, dz):
 
 @numba.njit(fastmath=True, error_model="numpy")
 def _brightness_at(image, opaque, to_pixels, point):
-    """Interpolate the brightness of a point in an image; -1 outside of it and where the background mixes in."""
+    """Interpolate the brightness of a point in an image; -1 outside the image and at the border to the background."""
     p = to_pixels[:, 0] * point[0] + to_pixels[:, 1] * point[1] + to_pixels[:, 2] * point[2] + to_pixels[:, 3]
     if p[2] <= 0:
         return -_ONE
@@ -150,10 +150,10 @@ def _brightness_at(image, opaque, to_pixels, point):
 
 @numba.njit(fastmath=True, error_model="numpy")
 def _look(solid, opaque, point, to_pixels, eyes, lights, brightness, seen, towards, is_lit):
-    """Collect what views see of a point: brightness, view's number, direction to the eye, and whether it is lit.
+    """Collect the views of a point: brightness, index of the view, direction to the camera, and whether it is lit.
 
     Returns:
-        How many views see it.
+        The number of views that see it.
     """
     count = 0
     x, y, z = point
@@ -207,7 +207,7 @@ def _misfit(normal, lights, seen, towards, is_lit, shade):
 
 @numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
 def _judge(misfit, solid, opaque, points, to_pixels, eyes, lights, brightness, normals):
-    """Fill in the least misfit of every point over all normals; -1 where too few views look."""
+    """Fill in the least misfit of every point over all normals; -1 if too few views see the point."""
     views = len(eyes)
     for n in numba.prange(len(points)):
         seen, towards = np.empty((views, 2), np.float32), np.empty((views, 3), np.float32)
@@ -251,11 +251,11 @@ def fit_voxels(field: KiloOSF, images: ImageSet, *, steps: int, rays: int, rng: 
     """Fit density, albedo and dipole of a field's voxels by some steps of descent.
 
     Args:
-        field: where to begin; its albedo and its networks are ignored.
-        images: what to learn from.
-        steps: of Adam.
-        rays: for each.
-        rng: chooses pixels and the offsets of samples.
+        field: initial field. Its albedo and its networks are ignored.
+        images: training images.
+        steps: steps of Adam.
+        rays: pixels per step.
+        rng: random generator of pixels and sample offsets.
     """
     source = RaySource(images)
     pixels = source.silhouette_pixels()
@@ -278,7 +278,7 @@ def fit_voxels(field: KiloOSF, images: ImageSet, *, steps: int, rays: int, rng: 
 
 
 def _keep_within(values: Float32[np.ndarray, "M 13"]) -> None:
-    """Clip to what features may be; row 0 is empty space."""
+    """Clip features to their ranges; row 0 is empty space."""
     np.clip(values[:, 0], -_MOST_G, _MOST_G, out=values[:, 0])
     np.clip(values[:, 1:4], 0, 1, out=values[:, 1:4])
     values[0] = 0
@@ -318,7 +318,7 @@ def _corners(index, p, rows, weights):
 
 @numba.njit(fastmath=True, error_model="numpy")
 def _walk(values, index, origin, direction, offset, rows, weights, features):
-    """Fill in the features along a ray, one sample a voxel, where there is density; return the number of samples."""
+    """Fill in the features along a ray, one sample per voxel with density; return the number of samples."""
     start, end = _ZERO, np.float32(1e9)
     for axis in range(3):
         start, end = clip_axis(
@@ -366,7 +366,7 @@ def _shade(features, count, light, gains, colour):
 
 @numba.njit(fastmath=True, error_model="numpy")
 def _spread(rows, weights, features, gains, count, depth, light, slope, slope_alpha, out):
-    """Add a ray's part to the gradient: back to front, with the light from behind summed up on the way."""
+    """Add a ray's part to the gradient: from back to front, while summing the light from behind."""
     behind, through = _ZERO, np.exp(-depth)
     own = np.empty(_FEATURES, np.float32)
     for s in range(count - 1, -1, -1):

@@ -1,15 +1,17 @@
 """KiloOSF: one object's relightable scattering function, as a voxel shell and a grid of tiny networks.
 
-f(x, light direction, view direction) -> (rho, sigma), paper eq. 1. A point's features are interpolated between the
-eight corners of its voxel; the tiny network of its cell turns them, the light and the view into the direct light it
-scatters:
+f(x, light direction, view direction) -> (rho, sigma), paper eq. 1. The features of a point are interpolated between the
+eight corners of its voxel. The tiny network of its cell computes the scattered direct light from them, the light and
+the view:
 
     sigma = max(softplus(g) - softplus(FLOOR), 0) / voxel                       [1 / unit of length]
     rho   = albedo * (ambient + max(n . l + network(n . l, latent, l, v, position in the cell), 0))
 
 with g, albedo, n and latent the features. Deviations from the paper, each measured in docs/notes/fields.md:
-density, reflectance and a dipole (n) live in voxels and not in the networks, so that occupied space, silhouettes and
-shadows need no network; the ambient part of rho is kept apart, so that a shadow can remove the direct part alone.
+
+- Density, reflectance and a dipole (n) are stored in voxels and not in the networks, so that occupied space,
+  silhouettes and shadows need no network.
+- The ambient part of rho is separate, so that a shadow removes only the direct part.
 """
 
 from __future__ import annotations
@@ -48,19 +50,28 @@ def network_size(hidden: int) -> int:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KiloOSF:
-    """A trained field in its object's frame. Lengths are in the units of its training set: metres for our own.
+    """A trained neural scattering function of one object, in the object's frame.
+
+    It holds features on the corners of a voxel grid and one tiny network for each cell of a coarser grid. Lengths are
+    in the units of its training set, which is metres unless the data came from elsewhere. `FieldLibrary.load` reads
+    one; `SceneRenderer` draws it.
 
     Attributes:
         origin: corner (0, 0, 0) of the voxel grid [m].
         voxel: side of a voxel [m].
-        index: row of each corner's features; 0 outside the shell.
-        rows: features of the corners in the shell; row 0 is empty space.
-        cells: number of the tiny network of each cell; cells divide the grid's box evenly.
+        index: row in `rows` of each corner; 0 for corners outside the shell around the surface.
+        rows: features of the M - 1 corners in the shell; row 0 is empty space.
+        cells: number of the tiny network of each cell. The cells divide the grid's box evenly.
         networks: parameters of C tiny networks, layer by layer: weights (inputs x outputs), then biases.
         hidden: width of the tiny networks.
-        ambient: what an unlit white point sends out, per colour.
-        macro: of each block of 4 x 4 x 4 voxels, how many blocks away the nearest density is; derived.
-        density: g on every corner; derived.
+        ambient: radiance of an unlit white point, per colour.
+        density: density feature g of every corner; derived from `rows`.
+        macro: for each block of 4 x 4 x 4 voxels, distance to the nearest block with density [blocks]; derived.
+
+    Example:
+        >>> lowest, highest = fields.load("006_mustard_bottle").extent
+        >>> (highest - lowest).round(2)  # width, depth and height of the bottle [m]
+        array([0.1 , 0.07, 0.2 ], dtype=float32)
     """
 
     origin: Float32[np.ndarray, "3"]
@@ -75,7 +86,7 @@ class KiloOSF:
     macro: UInt8[np.ndarray, "bx by bz"] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Derive what marching looks at."""
+        """Compute the derived arrays for ray marching."""
         density = np.ascontiguousarray(self.rows[:, 0][self.index])
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "macro", block_distances(density))
@@ -96,14 +107,14 @@ class KiloOSF:
 
 
 def numbered(shell: Bool[np.ndarray, "nx ny nz"]) -> Int32[np.ndarray, "nx ny nz"]:
-    """Number the corners of a shell in the order of the grid, from 1; the others get 0, the row of empty space."""
+    """Number the corners of a shell in the order of the grid, from 1. The others get 0, the row of empty space."""
     index = np.zeros(shell.shape, np.int32)
     index[shell] = 1 + np.arange(shell.sum(), dtype=np.int32)
     return index
 
 
 def without_light(field: KiloOSF) -> KiloOSF:
-    """Set n = 0 and make the networks blind to n . l and l: the radiance is then the same under every light."""
+    """Return a field with the same radiance under every light: n is 0, and the networks ignore n . l and l."""
     rows, networks = field.rows.copy(), field.networks.copy()
     rows[:, 4:7] = 0
     first = networks[:, : NETWORK_INPUTS * field.hidden].reshape(len(networks), NETWORK_INPUTS, field.hidden)
@@ -112,10 +123,10 @@ def without_light(field: KiloOSF) -> KiloOSF:
 
 
 def block_distances(density: Float32[np.ndarray, "nx ny nz"]) -> UInt8[np.ndarray, "bx by bz"]:
-    """Return how far each block of voxels is from the nearest one that holds density: in blocks, along the worst axis.
+    """Return the distance of each block of voxels to the nearest block with density, in blocks along the worst axis.
 
-    0 for those with density, 255 where there is none at all. A block counts the corners on all its faces. A ray in a
-    block at distance d may leave all blocks less than d away at once.
+    It is 0 for blocks with density, and 255 if there is no density at all. A block includes the corners on all its
+    faces. A ray in a block at distance d can skip all blocks less than d away.
     """
     shape = tuple(-(-(n - 1) // MACRO) for n in density.shape)
     solid = density > FLOOR_G
@@ -146,7 +157,7 @@ Tensors = tuple[Mapping[str, str], Mapping[str, np.ndarray]]  # metadata, and wh
 
 
 def write_field(path: Path, field: KiloOSF) -> None:
-    """Write a field; the file appears only when it is whole.
+    """Write a field. The file appears only once it is complete.
 
     Raises:
         CannotWrite: if the disk refuses.
@@ -155,7 +166,7 @@ def write_field(path: Path, field: KiloOSF) -> None:
 
 
 def field_bytes(field: KiloOSF) -> bytes:
-    """Return a field as the contents of a file. Features lose precision: 8 bits of each one's range."""
+    """Return a field as the contents of a file. Each feature is quantised to 8 bits of its range."""
     features = field.rows[1:]
     low = features.min(axis=0, initial=0).astype(np.float32)
     span = np.maximum(features.max(axis=0, initial=0) - low, 1e-6).astype(np.float32)
@@ -187,14 +198,14 @@ def read_field(path: Path) -> KiloOSF:
 
 
 def field_from_bytes(data: bytes, where: Path | str) -> KiloOSF:
-    """Make a field from the contents of a file.
+    """Return the field in the contents of a file.
 
     Args:
-        data: as `field_bytes` makes them.
-        where: what messages name.
+        data: contents, as `field_bytes` returns them.
+        where: name of the file in messages.
 
     Raises:
-        CorruptFile: if they are cut short, of another version or not a field.
+        CorruptFile: if the data are truncated, of another version or not a field.
     """
     meta, tensors = tensors_from_bytes(data, FORMAT, where)
     try:
@@ -257,10 +268,10 @@ def tensors_from_bytes(data: bytes, expected: str, where: Path | str) -> Tensors
     Args:
         data: the contents.
         expected: format that the metadata must name.
-        where: what messages name.
+        where: name of the file in messages.
 
     Raises:
-        CorruptFile: if they are cut short or of another format or version.
+        CorruptFile: if the data are truncated, or of another format or version.
     """
     meta, tensors = _parsed(data, where)
     found = meta.get("format", "no format at all")
@@ -270,7 +281,7 @@ def tensors_from_bytes(data: bytes, expected: str, where: Path | str) -> Tensors
 
 
 def tensor_format(path: Path) -> str | None:
-    """Return the format that a safetensors file names: the kind of its weights.
+    """Return the format in a safetensors file's metadata: the kind of its weights.
 
     Raises:
         CorruptFile: if the file is missing or cut short.

@@ -29,7 +29,7 @@ class Scatter(NamedTuple):
 
 
 class KiloQuery(nn.Module):
-    """A KiloOSF whose numbers are parameters."""
+    """A KiloOSF as a PyTorch module, whose numbers are parameters."""
 
     row_units: Float[Tensor, "8"]
     low: Float[Tensor, "3"]
@@ -46,7 +46,7 @@ class KiloQuery(nn.Module):
         device: torch.device | str = "cpu",
         row_units: Sequence[float] = (1.0,) * FEATURES,
     ) -> None:
-        """Copy a field's numbers; the parameter `rows` counts in `row_units`, which scales its steps in training."""
+        """Copy a field's numbers. The parameter `rows` is in units of `row_units`, which scales its training steps."""
         super().__init__()
         units = torch.tensor(row_units, dtype=dtype, device=device)
         self.register_buffer("row_units", units)
@@ -70,7 +70,7 @@ class KiloQuery(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where it computes."""
+        """The device of its parameters."""
         return self.rows.device
 
     def to_field(self, grid: KiloOSF) -> KiloOSF:
@@ -83,7 +83,7 @@ class KiloQuery(nn.Module):
         return KiloOSF(grid.origin, grid.voxel, grid.index, rows, grid.cells, networks, grid.hidden, ambient)
 
     def features(self, x: Float[Tensor, "S 3"]) -> Float[Tensor, "S 8"]:
-        """Interpolate features at points of the grid's box [m]; points outside are moved to its faces."""
+        """Interpolate features at points [m]. Points outside the grid's box are moved to its faces."""
         most = torch.tensor(self.shape, dtype=x.dtype, device=x.device) - 1.001
         p = torch.minimum(((x - self.low) / self.voxel).clamp(min=0), most)
         whole = p.floor()
@@ -121,9 +121,9 @@ class KiloQuery(nn.Module):
             x: points in the field's frame [m].
             light: unit vectors toward the light, in the field's frame.
             view: unit vectors from the camera into the scene, in the field's frame.
-            cell_jitter: in training, how far beyond its own cell a network is asked, in cells: neighbours that have
-                seen the same points agree at their border, so that relighting is smooth across it.
-            generator: of the jitter.
+            cell_jitter: in training, how far beyond its own cell a network is evaluated [cells]. Neighbouring networks
+                then agree at their border, so that relighting is smooth across it.
+            generator: random generator of the jitter.
         """
         features = self.features(x)
         albedo, normal, latent = features[:, 1:4], features[:, 4:7], features[:, 7:]

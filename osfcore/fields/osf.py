@@ -1,19 +1,23 @@
 """OSF: one object's relightable scattering function as one large network, the paper's own form (section 4.1).
 
-f(x, light direction, view direction) -> (rho, sigma), eq. 1, by a multilayer perceptron over positional encodings, as
-in NeRF: a trunk with one skip connection reads the position and gives the density and the albedo; one more layer of
-half its width, which also reads the light and the view, gives the light that is scattered:
+f(x, light direction, view direction) -> (rho, sigma), eq. 1, is a multilayer perceptron over positional encodings, as
+in NeRF. A trunk with one skip connection computes density and albedo from the position. One more layer of half its
+width, which also reads the light and the view, computes the scattered light:
 
     sigma = DENSITY_GAIN * softplus(s) / half of the box's longest side         [1 / unit of length]
     rho   = albedo * (ambient + softplus(gain))
 
-It is a teacher (`train_kiloosf.Distillation`) and a yardstick; what is shipped is a KiloOSF. Deviations from the paper:
-rho keeps an ambient part that neither light nor view changes, because our lamp comes with ambient light that no shadow
-removes and because every image shows one light only, from which a free split could not be learned; the sigmoid of the
-published code is on the albedo alone, so that a well-lit point may send out more than it; eq. 2's integral over light
-directions is one term, since the light is distant; lights and views have unit length, in training as in use (the
-published code mixes unit lights and such of length 15); positions are divided by the object's box, not by a constant of
-each scene; and samples are proposed by a voxel grid (`train_osf.NetworkStage`) in place of NeRF's coarse network.
+It serves as a teacher (`train_kiloosf.Distillation`) and for comparison; the shipped fields are KiloOSFs. Deviations
+from the paper:
+
+- rho has an ambient part that depends on neither light nor view. The lamp comes with ambient light that no shadow
+  removes, and every image shows one light only, from which a free split could not be learned.
+- The sigmoid of the published code is on the albedo alone, so that a well-lit point may send out more than its albedo.
+- The integral of eq. 2 over light directions is one term, since the light is distant.
+- Lights and views have unit length in training and in use. The published code mixes unit lights and lights of length
+  15.
+- Positions are divided by the object's box, not by a constant of each scene.
+- A voxel grid proposes samples (`train_osf.NetworkStage`) in place of NeRF's coarse network.
 """
 
 from __future__ import annotations
@@ -39,18 +43,18 @@ _FIRST_GAIN = -0.5
 
 @dataclass(frozen=True, slots=True)
 class OSFSize:
-    """How large the network is; the paper's is 8 x 256.
+    """Size of the network; the paper's is 8 x 256.
 
     Attributes:
-        depth: layers of the trunk; the position enters again halfway.
-        width: units of each.
+        depth: layers of the trunk. The position enters again halfway.
+        width: units of each layer.
     """
 
     depth: int = 4
     width: int = 64
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built.
+        """Check the ranges.
 
         Raises:
             InvalidInput: if a number is out of range.
@@ -83,11 +87,11 @@ class OSF(nn.Module):
         """Draw the first weights.
 
         Args:
-            box: of the object: lowest and highest corner [m].
-            size: of the network.
-            generator: of the weights, on the CPU.
-            dtype: of the parameters.
-            device: where they live.
+            box: box of the object: lowest and highest corner [m].
+            size: size of the network.
+            generator: random generator of the weights, on the CPU.
+            dtype: data type of the parameters.
+            device: device of the parameters.
         """
         super().__init__()
         self.size = size or OSFSize()
@@ -121,7 +125,7 @@ class OSF(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where it computes."""
+        """The device of its parameters."""
         return self.ambient.device
 
     def density(self, x: Float[Tensor, "S 3"]) -> Float[Tensor, "S"]:

@@ -1,4 +1,4 @@
-"""Rays through a field: those of an image set, marching along them, and the voxel shell that they need."""
+"""Rays through a field: the rays of an image set, ray marching, and the voxel shell that they need."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from osfcore.io.image_set import ImageSet
 
 # Walking along a ray through one field's density; compiled for the CPU.
 #
-# Samples lie at t = (k + 1/2) * step from the ray's origin, whatever the field's box, so that a ray meets the same
-# samples however it is cut into pieces.
+# Samples lie at t = (k + 1/2) * step from the ray's origin, independent of the field's box. A ray then meets the same
+# samples in whatever pieces it is marched.
 
 
-# Where neither OpenMP nor TBB is there, numba's threads end the process when two calls into parallel code overlap.
+# Without OpenMP and TBB, numba's threads end the process if two calls into parallel code overlap.
 ONE_AT_A_TIME = threading.Lock()
 _FLOOR = np.float32(DENSITY_FLOOR)
 _FLOOR_G = np.float32(FLOOR_G)
@@ -46,7 +46,7 @@ _EDGE = np.float32(1.001)  # before the last corner, so that there is always a n
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def optical_density(g):  # noqa: ANN001, ANN201
-    """Return sigma * voxel of a density feature g."""
+    """Return sigma * voxel for a density feature g."""
     if g <= _FLOOR_G:
         return np.float32(0)
     if g > np.float32(15):
@@ -86,7 +86,7 @@ def within(p, count):  # noqa: ANN001, ANN201
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201, D417
-    """Return the part of a ray between two bounds on one axis; where there is none, it ends before it begins.
+    """Return the part of a ray between two bounds on one axis. If there is none, the end is before the beginning.
 
     Args:
         origin, direction: of the ray on this axis.
@@ -101,12 +101,12 @@ def clip_axis(origin, direction, low, high, t0, t1):  # noqa: ANN001, ANN201, D4
 
 @numba.njit(fastmath=True, error_model="numpy", inline="always")
 def leave_blocks(p, d, inverse, block, distance):  # noqa: ANN001, ANN201
-    """Return how far a ray stays, on one axis, among the blocks known to be empty.
+    """Return how far a ray stays, on one axis, within blocks that are known to be empty.
 
     Args:
         p: where the ray is [voxels].
         d: component of its direction [voxels per unit of t].
-        inverse: of d.
+        inverse: 1 / d.
         block: number of its block on this axis.
         distance: blocks less than this far away are empty (`KiloOSF.macro`).
     """
@@ -175,23 +175,23 @@ def march(
     min_transmittance: float = 1e-3,
     most: int = 24,
 ) -> tuple[Float32[np.ndarray, "R most"], Bool[np.ndarray, "R most"]]:
-    """Find the samples of rays that matter: their distances from front to back [m], and which of the slots are used.
+    """Return the samples of rays that matter: their distances from front to back [m], and which slots are used.
 
     Args:
-        field: what the rays meet.
-        origins: of the rays in the field's frame [m].
+        field: field that the rays meet.
+        origins: origins of the rays in the field's frame [m].
         directions: unit vectors.
-        step: between samples [m].
-        offsets: of each ray's first sample, in steps; 1/2 by default, random in training.
-        min_weight: samples that would contribute less are left out.
-        min_transmittance: where less light passes, a ray ends.
-        most: samples a ray at most.
+        step: distance between samples [m].
+        offsets: offsets of each ray's first sample, in steps; 1/2 by default, random in training.
+        min_weight: smallest weight of a sample that is kept.
+        min_transmittance: transmittance at which a ray ends.
+        most: largest number of samples per ray.
     """
     count = len(origins)
     ts = np.zeros((count, most), np.float32)
     counts: Int64[np.ndarray, "R"] = np.zeros(count, np.int64)
     offsets = np.full(count, 0.5, np.float32) if offsets is None else offsets
-    # Other memory layouts and types would be compiled anew, which takes half a minute.
+    # Other memory layouts and types would need another compilation, which takes half a minute.
     origins, directions, offsets = (np.array(a, np.float32, order="C") for a in (origins, directions, offsets))
     voxel, every, least, passing = (np.float32(n) for n in (field.voxel, step, min_weight, min_transmittance))
     grid = field.density, field.macro, field.origin, voxel
@@ -208,7 +208,7 @@ _MARGIN_PX = 3  # beyond the silhouette, so that its edge is learned from both s
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RayBatch:
-    """R rays in the frame of a set, with what their pixels show.
+    """R rays in the frame of an image set, with the colours of their pixels.
 
     Attributes:
         origins: camera centres [m].
@@ -230,10 +230,10 @@ class RayBatch:
 
 
 class RaySource:
-    """The rays of a set's pixels. A pixel's number counts through images, rows and columns."""
+    """The rays of an image set's pixels. Pixels are numbered through images, rows and columns."""
 
     def __init__(self, images: ImageSet) -> None:
-        """Take over a set; its pixels are not copied."""
+        """Use an image set. Its pixels are not copied."""
         self._images = images
         self._origins = np.array([c.T_world_camera.position for c in images.cameras], np.float32)
         matrices = [c.T_world_camera.matrix()[:3, :3] @ np.linalg.inv(c.intrinsics) for c in images.cameras]
@@ -270,13 +270,13 @@ class RaySource:
 def least_opacity(
     points: Float32[np.ndarray, "n 3"], cameras: Sequence[Camera], alphas: Sequence[np.ndarray], allowed_misses: int
 ) -> Float32[np.ndarray, "n"]:
-    """Return the smallest opacity that any view shows at points; 1 for points that lie in no view's frame.
+    """Return the smallest opacity of points in any view; 1 for points outside all images.
 
     Args:
-        points: in the set's frame [m].
+        points: points in the frame of the image set [m].
         cameras: V views.
         alphas: V images of opacity in [0, 1], float32.
-        allowed_misses: that many of the smallest values are passed over: single wrong silhouettes carve nothing away.
+        allowed_misses: number of smallest values that are ignored, so that single wrong silhouettes remove nothing.
     """
     least = np.ones((allowed_misses + 1, len(points)), np.float32)
     for camera, alpha in zip(cameras, alphas, strict=True):
@@ -321,13 +321,13 @@ def first_shell(images: ImageSet, box: Float[np.ndarray, "2 3"], *, across: int,
     """Fill the visual hull with a coarse grey field.
 
     Args:
-        images: whose silhouettes carve.
-        box: of the object [m].
+        images: images whose silhouettes carve the hull.
+        box: box of the object [m].
         across: voxels along the longest side of the box.
         cells: tiny networks along the longest side.
-        hidden: their width.
-        inside_g: density feature inside the hull; thin fog lets light reach what silhouettes cannot carve.
-        rng: for the networks' first weights.
+        hidden: width of the tiny networks.
+        inside_g: density feature inside the hull. Thin fog lets light reach hollows that silhouettes cannot carve.
+        rng: random generator of the networks' initial weights.
     """
     origin, voxel, shape = grid_over(box, across)
     points = origin + voxel * np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
@@ -349,7 +349,7 @@ def first_shell(images: ImageSet, box: Float[np.ndarray, "2 3"], *, across: int,
 
 
 def grid_over(box: Float[np.ndarray, "2 3"], across: int) -> tuple[np.ndarray, float, tuple[int, int, int]]:
-    """Return origin [m], voxel side [m] and shape of a grid over a box, one voxel wider on every side."""
+    """Return origin [m], voxel side [m] and shape of a grid over a box, with a margin of one voxel."""
     voxel = float((box[1] - box[0]).max() / across)
     shape = np.ceil((box[1] - box[0]) / voxel - 1e-6).astype(int) + 3
     middle = (box[0] + box[1]) / 2
@@ -360,16 +360,16 @@ def shell_field(
     origin: np.ndarray, voxel: float, features: Float32[np.ndarray, "nx ny nz 8"], keep: Bool[np.ndarray, "nx ny nz"],
     cells: np.ndarray, networks: np.ndarray, ambient: np.ndarray,
 ) -> KiloOSF:  # fmt: skip
-    """Make a field of some corners of a grid; those on the grid's faces stay empty, so that nothing is cut off.
+    """Return a field with some corners of a grid. Corners on the grid's faces stay empty, so that nothing is cut off.
 
     Args:
         origin: corner (0, 0, 0) of the grid [m].
         voxel: side of a voxel [m].
-        features: of all corners.
+        features: features of all corners.
         keep: corners that belong to the shell.
         cells: number of the tiny network of each cell.
-        networks: parameters of the tiny networks; their width follows from them.
-        ambient: what an unlit white point sends out, per colour.
+        networks: parameters of the tiny networks, from which their width follows.
+        ambient: radiance of an unlit white point, per colour.
     """
     keep = keep.copy()
     for axis in range(3):
@@ -385,27 +385,27 @@ def reshelled(
     """Return a field with another shell on the same grid.
 
     Args:
-        field: gives the grid, the networks and the ambient light.
+        field: field with the grid, the networks and the ambient light.
         keep: corners that belong to the shell.
-        features: of all corners; the field's own by default.
+        features: features of all corners; the field's own by default.
     """
     features = field.rows[field.index] if features is None else features
     return shell_field(field.origin, field.voxel, features, keep, field.cells, field.networks, field.ambient)
 
 
 def refine(field: KiloOSF, images: ImageSet, *, across: int, rng: np.random.Generator) -> KiloOSF:
-    """Return the same field on a finer grid, kept only around the surfaces that some view sees.
+    """Return the same field on a finer grid, only around surfaces that some view sees.
 
     Args:
-        field: on the coarse grid.
+        field: field on the coarse grid.
         images: the views.
-        across: voxels along the longest side of what is occupied.
-        rng: chooses the pixels to look at, where there are very many.
+        across: voxels along the longest side of the occupied part.
+        rng: random generator, which chooses pixels if there are very many.
     """
     origin, voxel, shape = grid_over(field.extent, across)
     coarse = np.where((field.index > 0)[..., None], field.rows[field.index], 0)
     coarse[..., 0] = field.density
-    # Interpolation near the shell's rim must not mix colours with the nothing outside.
+    # Interpolation near the shell's rim must not mix colours with empty space outside.
     nearest = ndimage.distance_transform_edt(field.index == 0, return_distances=False, return_indices=True)
     coarse[..., 1:] = coarse[tuple(np.asarray(nearest))][..., 1:]
     places = (origin[:, None] + voxel * np.indices(shape).reshape(3, -1) - field.origin[:, None]) / field.voxel
@@ -418,12 +418,12 @@ def refine(field: KiloOSF, images: ImageSet, *, across: int, rng: np.random.Gene
 
 
 def seen_corners(field: KiloOSF, images: ImageSet, rng: np.random.Generator) -> Bool[np.ndarray, "nx ny nz"]:
-    """Find the grid corners next to which some pixel's ray meets something.
+    """Return the grid corners near which some pixel's ray meets density.
 
     Args:
-        field: what the rays meet.
+        field: field that the rays meet.
         images: the views.
-        rng: chooses the pixels to look at, where there are very many.
+        rng: random generator, which chooses pixels if there are very many.
     """
     seen = np.zeros(field.index.shape, bool)
     for places in _met(field, images, _VISIBLE_WEIGHT, rng):
@@ -432,12 +432,12 @@ def seen_corners(field: KiloOSF, images: ImageSet, rng: np.random.Generator) -> 
 
 
 def trim(field: KiloOSF, images: ImageSet, needed_weight: float) -> KiloOSF:
-    """Leave out the corners that no view of the training set needs: the field is smaller and renders the same.
+    """Remove the corners that no training view needs. The field becomes smaller and renders the same.
 
     Args:
-        field: what was trained.
-        images: what it was trained on.
-        needed_weight: samples that show less in every view need no corners; above 0.05 it begins to cost quality.
+        field: the trained field.
+        images: its training images.
+        needed_weight: smallest weight of a sample, in any view, whose corners are kept. Above 0.05 quality decreases.
     """
     used = np.zeros(field.index.shape, bool)
     for places in _met(field, images, needed_weight):
@@ -452,7 +452,7 @@ def trim(field: KiloOSF, images: ImageSet, needed_weight: float) -> KiloOSF:
 def _met(
     field: KiloOSF, images: ImageSet, min_weight: float, rng: np.random.Generator | None = None
 ) -> Iterator[Float32[np.ndarray, "n 3"]]:
-    """Yield what the pixels' rays meet, in voxel coordinates; `rng` chooses some pixels of very many."""
+    """Yield the samples on the pixels' rays, in voxel coordinates; `rng` chooses pixels if there are very many."""
     source = RaySource(images)
     pixels = source.silhouette_pixels()
     if rng is not None:

@@ -2,8 +2,8 @@
 
     radiance(x, y, l) = albedo(x, y) * (ambient + l_z * network(l))
 
-The direct part carries the factor l_z, so that it vanishes as the light sinks to the table's plane: this separates it
-from the ambient part, although no training image shows a shadow. Shadows remove the direct part.
+The direct part has the factor l_z, so that it vanishes for a light in the table's plane. This separates it from the
+ambient part, although no training image shows a shadow. Shadows remove the direct part.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ _ARRAYS = ("albedo", "ambient", "background", "w1", "b1", "w2", "b2")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TableField:
-    """The bare table.
+    """The field of the bare table.
 
     Attributes:
         half_side: the table covers |x|, |y| <= half_side [m].
         albedo: reflectance on a regular grid over the table, x by y, interpolated.
-        ambient: what an unlit white point sends out.
+        ambient: radiance of an unlit white point.
         background: radiance beyond the table's edge.
-        w1, b1, w2, b2: the network from the light's direction to the direct light per unit of l_z.
+        w1, b1, w2, b2: weights of the network from the light's direction to the direct light per unit of l_z.
     """
 
     half_side: float
@@ -45,13 +45,13 @@ class TableField:
     b2: Float32[np.ndarray, "3"]
 
     def direct(self, lights: Float[np.ndarray, "B 3"]) -> Float32[np.ndarray, "B 3"]:
-        """Return the direct light on a white point of the table under each light, where nothing shades it."""
+        """Return the direct light on an unshaded white point of the table under each light."""
         hidden = np.maximum(lights.astype(np.float32) @ self.w1 + self.b1, 0)
         return np.maximum(hidden @ self.w2 + self.b2, 0) * np.maximum(lights[:, 2:], 0).astype(np.float32)
 
 
 def write_table(path: Path, table: TableField) -> None:
-    """Write a table; the file appears only when it is whole.
+    """Write a table. The file appears only once it is complete.
 
     Raises:
         CannotWrite: if the disk refuses.
@@ -75,14 +75,14 @@ def read_table(path: Path) -> TableField:
 
 
 def table_from_bytes(data: bytes, where: Path | str) -> TableField:
-    """Make a table from the contents of a file.
+    """Return the table in the contents of a file.
 
     Args:
-        data: as `table_bytes` makes them.
-        where: what messages name.
+        data: contents, as `table_bytes` returns them.
+        where: name of the file in messages.
 
     Raises:
-        CorruptFile: if they are cut short, of another version or not a table.
+        CorruptFile: if the data are truncated, of another version or not a table.
     """
     return _table(tensors_from_bytes(data, TABLE_FORMAT, where), where)
 

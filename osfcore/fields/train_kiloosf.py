@@ -1,9 +1,13 @@
 """Training a KiloOSF straight from images, cameras, lights and silhouettes: a coarse solid first, then a fine shell.
 
-Phases share the time budget. Recipe "direct": the visual hull of the silhouettes becomes a coarse field, which learns
-until it knows where surfaces are (also those that no silhouette shows); the corners that some pixel sees are kept on a
-fine grid, which learns the rest. Recipe "distil", the paper's: an OSF learns from the images, a fine field learns from
-it, and then from the images. A checkpoint beside the output lets the same command go on after it was killed.
+Phases share the time budget. There are two recipes:
+
+- "direct": the visual hull of the silhouettes becomes a coarse field. It learns until it has found the surfaces,
+  including those that no silhouette shows. The corners that some pixel sees are then kept on a fine grid, which learns
+  the rest.
+- "distil", as in the paper: an OSF learns from the images; a fine field learns from the OSF, and then from the images.
+
+A checkpoint beside the output lets the same command continue after it was killed.
 """
 
 from __future__ import annotations
@@ -58,11 +62,10 @@ from osfcore.progress import Progress
 
 # From an OSF to a KiloOSF: the second of the paper's three steps; fine-tuning on images follows.
 #
-# The teacher's density is baked into the corners of a fine grid, which gives the shell; then albedo, dipoles,
-# ambient light and the tiny networks learn to answer as the teacher does at random points near the surface. Lights
-# and views are drawn from those that the images have, each light turned a little: elsewhere a teacher knows nothing
-# (the published recipe asks it at lights that it never saw). Points lie along pixels' rays, so that no view comes
-# from inside.
+# The teacher's density is baked into the corners of a fine grid, which gives the shell. Albedo, dipoles, ambient light
+# and the tiny networks then learn the teacher's values at random points near the surface. Lights and views are drawn
+# from those of the images, with each light turned a little, because a teacher is wrong elsewhere. (The published recipe
+# uses lights that the teacher never saw.) Points lie along pixels' rays, so that no view comes from inside.
 
 
 _DISTILLATION_RATES = Rates(2e-2, 5e-3)
@@ -78,16 +81,16 @@ _POINTS_AT_ONCE = 32_768
 def first_student(
     osf: OSF, proposal: KiloOSF, images: ImageSet, *, across: int, cells: int, hidden: int, rng: np.random.Generator
 ) -> KiloOSF:
-    """Make a field with the teacher's density and albedo, and dipoles across its surface.
+    """Return a field with the teacher's density and albedo, and dipoles across its surface.
 
     Args:
-        osf: teacher.
+        osf: the teacher.
         proposal: its density on a coarse grid.
-        images: whose views decide which corners matter.
+        images: images whose views decide which corners matter.
         across: voxels along the longest side.
         cells: tiny networks along the longest side.
-        hidden: their width.
-        rng: for the networks' first weights.
+        hidden: width of the tiny networks.
+        rng: random generator of the networks' initial weights.
     """
     box = _occupied_box(osf, proposal)
     whole = first_shell(images, box, across=across, cells=cells, hidden=hidden, inside_g=0.0, rng=rng)
@@ -111,7 +114,7 @@ def first_student(
 
 
 def _occupied_box(osf: OSF, proposal: KiloOSF) -> Float[np.ndarray, "2 3"]:
-    """Return the box of all that the teacher's density reaches on the proposals' grid, and a voxel more [m]."""
+    """Return the box of the teacher's density on the proposals' grid, with a margin of one voxel [m]."""
     places = corners(proposal)[proposal.density > FLOOR_G]
     places = places[baked_g(osf, places, proposal.voxel) > FLOOR_G] if len(places) else places
     if not len(places):
@@ -129,7 +132,7 @@ class Distillation(Stage):
     """A KiloOSF while it learns from a teacher."""
 
     def __init__(self, field: KiloOSF, osf: OSF, device: torch.device) -> None:
-        """Begin with a field's numbers and a trained teacher."""
+        """Start with a field's numbers and a trained teacher."""
         super().__init__(field, _DISTILLATION_RATES, device)
         self.osf = osf
 
@@ -137,8 +140,8 @@ class Distillation(Stage):
         """Take one step of descent on random points near the surface.
 
         Args:
-            rays: points lie near what they meet, seen along them; lights are drawn from theirs.
-            share: of the stage that is done, in [0, 1].
+            rays: rays along which points lie near the surface, and whose lights are drawn.
+            share: share of the stage that is done, in [0, 1].
             rng: draws points and lights.
             generator: draws the jitter of the cells.
 
@@ -196,18 +199,18 @@ class Distillation(Stage):
         return points, lights / np.linalg.norm(lights, axis=1, keepdims=True), directions[ray]
 
     def state(self) -> dict[str, Any]:
-        """Return what a checkpoint needs besides the field."""
+        """Return the contents of a checkpoint besides the field."""
         return {**super().state(), "teacher": self.osf.state_dict(), "box": torch.tensor(self.osf.box)}
 
     @staticmethod
     def restored(field: KiloOSF, state: dict[str, Any], size: OSFSize, device: torch.device) -> Distillation:
-        """Go on from a checkpoint.
+        """Continue from a checkpoint.
 
         Args:
-            field: as it was.
-            state: as `state` returned it.
-            size: of the teacher's network.
-            device: that computes.
+            field: the field in the checkpoint.
+            state: the result of `state`.
+            size: size of the teacher's network.
+            device: PyTorch device.
         """
         osf = OSF(state["box"].numpy(), size, device=device)
         osf.load_state_dict(state["teacher"])
@@ -225,24 +228,24 @@ _COARSE_RATES, _FINE_RATES = Rates(2e-2, 1e-2), Rates(2e-2, 1e-3)
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a field is trained; docs/notes/fields.md has the measurements behind the numbers.
+    """Settings of a training; docs/notes/fields.md has the measurements behind the numbers.
 
     Attributes:
         coarse_across: voxels along the longest side in the first phase.
-        fine_across: the same in the second.
-        coarse_share: of the time budget.
+        fine_across: voxels along the longest side in the second phase.
+        coarse_share: share of the time budget for the first phase.
         cells: tiny networks along the longest side.
-        hidden: their width.
+        hidden: width of the tiny networks.
         rays: pixels per step of descent.
-        solid_g: density feature inside the visual hull at first.
-        hollow_across: instead of coarse_across for hollow objects: views agree on fine surfaces.
-        hollow_g: density feature of the fog around the surfaces on which views agree, from which edges grow.
-        hollow_steps: of descent without networks, before the first phase of a hollow object.
-        hollow_share: instead of coarse_share for hollow objects: opening a hollow takes time.
+        solid_g: initial density feature inside the visual hull.
+        hollow_across: replaces coarse_across for hollow objects, since views agree only on fine surfaces.
+        hollow_g: density feature of the fog around the surfaces on which views agree, from which edges can grow.
+        hollow_steps: steps of descent without networks, before the first phase of a hollow object.
+        hollow_share: replaces coarse_share for hollow objects, since opening a hollow takes time.
         coarse_rates: learning rates of the first phase.
-        fine_rates: of the second.
-        teacher_share: of the time budget, in recipe "distil".
-        distil_share: likewise.
+        fine_rates: learning rates of the second.
+        teacher_share: share of the time budget for the teacher, in recipe "distil".
+        distil_share: share of the time budget for distillation, in recipe "distil".
     """
 
     coarse_across: int = 48
@@ -267,9 +270,9 @@ class TrainField(FieldSettings):
     """A training run.
 
     Attributes:
-        hollow: the object has hollows that no silhouette shows, such as a bowl's; "direct" only.
-        recipe: "direct", or "distil" for the paper's way over a teacher.
-        lit: False for colours that do not depend on the light, as a NeRF's, to compare with; "direct" only.
+        hollow: whether the object has hollows that no silhouette shows, such as a bowl; only with recipe "direct".
+        recipe: "direct", or "distil" to learn from a teacher as in the paper.
+        lit: False for colours that do not depend on the light, as in a NeRF, for comparison; only with recipe "direct".
     """
 
     hollow: bool = False
@@ -277,10 +280,10 @@ class TrainField(FieldSettings):
     lit: bool = True
 
     def check(self) -> None:
-        """Refuse what is out of range, and a place that cannot be written.
+        """Check the ranges and the output.
 
         Raises:
-            InvalidInput: naming what is wrong, or if a file of somebody else lies where the metrics belong.
+            InvalidInput: if a value is out of range, or another program's file lies in place of the metrics.
             CannotWrite: if the output cannot be written.
         """
         if self.recipe not in ("direct", "distil"):
@@ -298,11 +301,11 @@ def train_field(config: TrainField, recipe: Recipe | None = None, pace: Pace | N
     """Train a field from an image set and write it.
 
     Raises:
-        InvalidInput: if the settings are out of range, cuda is asked for and not there, or a file of somebody else lies
-            where the metrics belong.
-        CorruptFile: if the image set is not sound, nothing of the object could be learned, or the checkpoint of a
-            killed run cannot be gone on from.
-        CannotWrite: if the output cannot be written, which is tried first.
+        InvalidInput: if the settings are out of range, there is no GPU for "cuda", or another program's file lies in
+            place of the metrics.
+        CorruptFile: if the image set is damaged, nothing of the object could be learned, or the checkpoint of a killed
+            run cannot be used.
+        CannotWrite: if the output cannot be written, which is checked first.
     """
     device = pick_device(config.device)
     config.check()
@@ -351,7 +354,7 @@ class _Training(FieldTraining):
         return self._stage(phase, field)
 
     def _coarse(self, box: Float[np.ndarray, "2 3"]) -> KiloOSF:
-        """Fill the visual hull, or what views agree on of a hollow object."""
+        """Fill the visual hull, or the surfaces of a hollow object on which the views agree."""
         r, hollow = self._recipe, self._config.hollow
         across = r.hollow_across if hollow else r.coarse_across
         field = first_shell(self.train, box, across=across, cells=r.cells, hidden=r.hidden,
@@ -382,7 +385,7 @@ class _Training(FieldTraining):
         return data, look, {"hollow": config.hollow, "lit": config.lit, "recipe": recipe, **teacher}
 
     def _trimmed(self, field: KiloOSF) -> bytes:
-        """Return the field as a file of at most the size aimed at, if leaving out what hardly shows can make it so."""
+        """Return the field as a file of at most the wanted size, if removing hardly visible parts is enough."""
         data = b""
         field = field if self._config.lit else without_light(field)
         for needed_weight in _NEEDED_WEIGHTS:

@@ -1,7 +1,7 @@
 """Training an OSF from images by volume rendering: the first of the paper's three steps to a KiloOSF.
 
-Holds what every training of a field shares: stages of gradient descent, measuring on unseen images, checkpoints, and
-the training of several stages one after the other.
+This file holds the common parts of all trainings of fields: stages of gradient descent, measurements on unseen images,
+checkpoints, and trainings of several stages.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ MOST_G = 10.0  # and least: a shorter range loses less when it is stored in 8 bi
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Learning rate at the beginning and the end of a stage; exponential between."""
+    """Learning rates at the beginning and the end of a stage; exponential in between."""
 
     first: float
     last: float
@@ -84,7 +84,7 @@ def _image_loss(
 
 
 class Stage:
-    """A field on a fixed grid while it learns."""
+    """A field on a fixed grid during training."""
 
     def __init__(self, field: KiloOSF, rates: Rates, device: torch.device) -> None:
         """Begin with a field's numbers."""
@@ -100,7 +100,7 @@ class Stage:
 
         Args:
             rays: with the pixels' colours and opacities.
-            share: of the stage that is done, in [0, 1].
+            share: share of the stage that is done, in [0, 1].
             rng: draws the offsets of the samples along the rays.
             generator: draws the jitter of the cells.
 
@@ -142,7 +142,7 @@ class Stage:
         self._count = state["count"]
 
 
-# Checkpoints of a training run: everything that is needed to go on as if nothing had happened.
+# Checkpoints of a training run, from which it continues exactly.
 
 
 _ARRAYS = ("origin", "index", "rows", "cells", "networks", "ambient")
@@ -154,9 +154,9 @@ class Checkpoint:
 
     Attributes:
         stage: name of the phase.
-        field: the field as it is.
-        optimiser: its moments and step count.
-        clock: time and steps spent, last measurements.
+        field: the present field.
+        optimiser: moments and step count of the optimiser.
+        clock: time and steps so far, and the last measurements.
         random: states of the random generators.
     """
 
@@ -167,10 +167,10 @@ class Checkpoint:
     random: dict[str, Any]
 
     def write(self, path: Path, fingerprint: Mapping[str, Any]) -> None:
-        """Write the checkpoint; the former one stays until the new one is whole.
+        """Write the checkpoint. The former one stays until the new one is complete.
 
         Args:
-            path: of the file.
+            path: path of the file.
             fingerprint: settings and data of the run, which `read` compares.
 
         Raises:
@@ -184,10 +184,10 @@ class Checkpoint:
 
     @staticmethod
     def read(path: Path, fingerprint: Mapping[str, Any]) -> Checkpoint | None:
-        """Read the checkpoint of the same run; None if there is none, it is cut short, or of other settings.
+        """Return the checkpoint of the same run; None if it is missing, truncated, or of other settings.
 
         Raises:
-            CorruptFile: if it is of this run, but cannot be used.
+            CorruptFile: if it is of this run but cannot be used.
         """
         content = read_content(path, dict(fingerprint))
         if content is None:
@@ -199,11 +199,11 @@ class Checkpoint:
             return Checkpoint(content["stage"], field, content["optimiser"], content["clock"], content["random"])
 
 
-# Descent of a whole network on an image set, its samples proposed by a density grid that is baked from it.
+# Descent of a whole network on an image set. A density grid, which is baked from the network, proposes samples.
 #
-# The grid begins as fog in the visual hull of the silhouettes and is baked anew from the network every so often, so
-# that samples gather where the network has found surfaces; a rim of fog stays around them, so that they can still
-# move. It is what an occupancy grid is in KiloNeRF, and stands in place of NeRF's coarse network.
+# The grid begins as fog in the visual hull of the silhouettes. It is regularly baked again from the network, so that
+# samples gather at the surfaces that the network has found. A rim of fog stays around surfaces, so that they can still
+# move. The grid corresponds to the occupancy grid of KiloNeRF, and replaces NeRF's coarse network.
 
 
 FOG_G = -2.0  # about 0.06 of the light is lost between two samples
@@ -240,12 +240,12 @@ class FieldNetwork(Protocol):
 
 
 class NetworkStage:
-    """A network while it learns, with the grid that proposes its samples.
+    """A network during training, with the grid that proposes its samples.
 
     Args:
-        network: learns in place.
+        network: network that is trained in place.
         proposal: density that decides where samples lie along a ray.
-        hull: corners of the proposals' grid outside which the object cannot be.
+        hull: corners of the proposals' grid that may belong to the object.
         rates: learning rates.
         rebake: steps between two bakes of the proposals.
     """
@@ -264,7 +264,7 @@ class NetworkStage:
 
         Args:
             rays: with the pixels' colours and opacities.
-            share: of the training that is done, in [0, 1].
+            share: share of the training that is done, in [0, 1].
             rng: draws the offsets of the samples along the rays.
             _generator: not needed here; the stages of a KiloOSF draw from it.
 
@@ -280,7 +280,7 @@ class NetworkStage:
         return found
 
     def update_proposal(self) -> None:
-        """Propose samples where the network now has density, and thinly around."""
+        """Update the grid: samples where the network now has density, and a few around it."""
         grid = self._proposal
         g = np.full(grid.index.shape, EMPTY_G, np.float32)
         g[self._hull] = baked_g(self.network, corners(grid)[self._hull], grid.voxel)
@@ -293,7 +293,7 @@ class NetworkStage:
         self._proposal = reshelled(grid, rim, features)
 
     def snapshot(self) -> KiloOSF:
-        """Return the proposals: density alone means something in them."""
+        """Return the proposals, in which only the density is meaningful."""
         return self._proposal
 
     def glance(self, images: ImageSet) -> Look:
@@ -306,7 +306,7 @@ class NetworkStage:
         return {"network": network, "adam": self._optimiser.state_dict(), "count": self._count, "hull": hull}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; the network and the proposals are given to the constructor."""
+        """Continue from a checkpoint. The constructor receives the network and the proposals."""
         self._optimiser.load_state_dict(state["adam"])
         self._count = state["count"]
 
@@ -319,12 +319,12 @@ def corners(grid: KiloOSF) -> Float32[np.ndarray, "nx ny nz 3"]:
 
 @torch.no_grad()
 def baked_g(network: FieldNetwork, points: Float32[np.ndarray, "n 3"], voxel: float) -> Float32[np.ndarray, "n"]:
-    """Return density features as dense as a network, at points; EMPTY_G where that is next to nothing.
+    """Return density features with the density of a network at points; EMPTY_G if it is almost 0.
 
     Args:
-        network: that is baked.
-        points: in the object's frame [m].
-        voxel: side of the voxels that get the features [m].
+        network: network to bake.
+        points: points in the object's frame [m].
+        voxel: side of the voxels with the features [m].
     """
     pieces = np.array_split(points, max(1, len(points) // _POINTS_AT_ONCE))
     parts = [network.density(torch.as_tensor(piece, device=network.device)).cpu() for piece in pieces]
@@ -338,7 +338,7 @@ def inverse_density(depth: Float32[np.ndarray, "n"]) -> Float32[np.ndarray, "n"]
     return np.where(depth < _FAINT_DEPTH, EMPTY_G, np.minimum(g, MOST_G)).astype(np.float32)
 
 
-# Measuring a field or a network on images that it did not learn from.
+# Measurements of a field or a network on images that it was not trained on.
 
 
 _GLANCE_IMAGES = 6
@@ -353,8 +353,8 @@ class Look:
     Attributes:
         psnr_full: mean over images of the PSNR of the whole image over black [dB].
         psnr_mask: mean over images of the PSNR inside the silhouette, dilated by 2 px [dB].
-        images: how many were looked at.
-        preview: one of them, always the same, in bright light: truth, ours, difference x 4.
+        images: number of images.
+        preview: one of them, always the same, in bright light: truth, rendering, difference x 4.
     """
 
     psnr_full: float
@@ -364,11 +364,11 @@ class Look:
 
 
 class Holdout:
-    """The test images of a set.
+    """The test images of an image set.
 
     Args:
-        images: the split; its pixels are not copied.
-        network: what is measured, with a field that proposes its samples; by default fields themselves.
+        images: the images. Their pixels are not copied.
+        network: network to measure, for which fields propose samples; None to measure the fields themselves.
     """
 
     def __init__(self, images: ImageSet, network: FieldNetwork | None = None) -> None:
@@ -387,7 +387,7 @@ class Holdout:
         return self._look(field, range(len(self._images.cameras)))
 
     def beside(self, fields: Sequence[KiloOSF], count: int = 3) -> UInt8[np.ndarray, "h w 3"]:
-        """Draw a few images under each other: the truth, and beside it what each of the fields makes of it."""
+        """Return a few images below each other: the truth, and beside it the rendering of each field."""
         rows = []
         for number in self._some(count):
             pairs = [self._pair(self._query(field), field, number) for field in fields]
@@ -395,7 +395,7 @@ class Holdout:
         return to_uint8(np.vstack(rows))
 
     def _some(self, count: int) -> list[int]:
-        """Choose images that are spread evenly over the split."""
+        """Return images spread evenly over the split."""
         return np.unique(np.linspace(0, len(self._images.cameras) - 1, count).astype(int)).tolist()
 
     def _look(self, field: KiloOSF, numbers: Sequence[int]) -> Look:
@@ -415,7 +415,7 @@ class Holdout:
 
     @torch.no_grad()
     def _pair(self, query: FieldNetwork, field: KiloOSF, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the truth and ours of one image over black."""
+        """Return the truth and the rendering of one image over black."""
         rays = self._source.batch(self._source.image_pixels(number))
         colour, _ = composite(query, field, rays, min_weight=self._min_weight, most=self._most, device=query.device)
         shape = (*self._source.image_shape, 3)
@@ -427,15 +427,15 @@ def _decibels(squared_error: Float[np.ndarray, "*shape"]) -> float:
     return float(-10 * np.log10(max(float(np.mean(squared_error)), _MIN_ERROR)))
 
 
-# The teacher: an OSF that learns from images, its samples proposed by a grid as above.
+# The teacher: an OSF that learns from images, with samples proposed by a grid as above.
 
 
 @dataclass(frozen=True, slots=True)
 class TeacherRecipe:
-    """How a teacher is trained.
+    """Settings of a teacher's training.
 
     Attributes:
-        size: of its network.
+        size: size of its network.
         across: voxels of the proposals along the longest side of the box.
         rays: pixels per step of descent.
         rebake: steps between two bakes of the proposals.
@@ -456,11 +456,11 @@ def first_teacher(
     """Draw a new network, and fill the visual hull with fog.
 
     Args:
-        images: whose silhouettes carve the hull.
-        box: of the object [m].
-        recipe: how it learns.
-        rng: draws the first weights.
-        device: that computes.
+        images: images whose silhouettes carve the hull.
+        box: box of the object [m].
+        recipe: settings of its training.
+        rng: random generator of the initial weights.
+        device: PyTorch device.
     """
     fog = first_shell(images, box, across=recipe.across, cells=1, hidden=8, inside_g=FOG_G, rng=rng)
     weights = torch.Generator().manual_seed(int(rng.integers(2**62)))
@@ -471,13 +471,13 @@ def first_teacher(
 def restored_teacher(
     proposal: KiloOSF, state: dict[str, Any], recipe: TeacherRecipe, device: torch.device
 ) -> NetworkStage:
-    """Go on from a checkpoint.
+    """Continue from a checkpoint.
 
     Args:
-        proposal: as it was.
-        state: as `NetworkStage.state` returned it.
-        recipe: how it learns.
-        device: that computes.
+        proposal: the proposals in the checkpoint.
+        state: the result of `NetworkStage.state`.
+        recipe: settings of its training.
+        device: PyTorch device.
     """
     osf = OSF(proposal.box, recipe.size, device=device)
     osf.load_state_dict(state["network"])
@@ -486,7 +486,7 @@ def restored_teacher(
     return stage
 
 
-# A whole training: phases that share a budget, and a checkpoint beside the output from which a killed run goes on.
+# A whole training: phases that share a budget, and a checkpoint beside the output from which a killed run continues.
 
 
 _LOOK_SHARE = 0.05  # of the budget between two looks at held-out images
@@ -496,17 +496,17 @@ _METRICS = ("psnr_full", "psnr_mask")  # by which a file of metrics is known
 
 @dataclass(frozen=True, slots=True)
 class FieldSettings:
-    """What is asked of any training of a field.
+    """Settings of every training of a field.
 
     Attributes:
-        data: image set in the OSF format; `train` is learned from, `test` measured on.
-        out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
+        data: image set in the OSF format, with `train` to learn from and `test` to measure on.
+        out: file to write, FILE.safetensors. Metrics go beside it to FILE.json.
         minutes: time budget of the descent [min].
         device: "auto", "cpu" or "cuda".
-        seed: of everything random.
-        iterations: instead of the time budget, that many steps: repeatable on one machine.
+        seed: seed of everything random.
+        iterations: number of steps instead of the time budget; the result is then repeatable on one machine.
         teacher_width: units of each layer of the teacher.
-        teacher_depth: its layers.
+        teacher_depth: layers of the teacher.
     """
 
     data: Path
@@ -520,14 +520,14 @@ class FieldSettings:
 
     @property
     def total(self) -> int:
-        """Steps of descent, or else seconds."""
+        """Number of steps of descent, or the time budget [s]."""
         return self.iterations or max(1, round(self.minutes * 60))
 
     def check(self) -> None:
-        """Refuse what is out of range, and a place that cannot be written.
+        """Check the ranges and the output.
 
         Raises:
-            InvalidInput: naming what is wrong, or if a file of somebody else lies where the metrics belong.
+            InvalidInput: if a value is out of range, or another program's file lies in place of the metrics.
             CannotWrite: if the output cannot be written.
         """
         if not 0.05 <= self.minutes <= 24 * 60:
@@ -542,7 +542,7 @@ class FieldSettings:
         """Read the images to learn from, and those to measure on.
 
         Raises:
-            CorruptFile: if the image set is not sound, or shows no object.
+            CorruptFile: if the image set is damaged, or shows no object.
         """
         train, test = read_splits(self.data)
         if train.is_opaque:
@@ -553,12 +553,12 @@ class FieldSettings:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How often a training reports; it does not change what is learned.
+    """How often a training reports. It does not change the result.
 
     Attributes:
-        report_s: between two reports [s].
-        checkpoint_s: between two checkpoints [s].
-        clock: the time that counts for both and for the budget [s].
+        report_s: time between two reports [s].
+        checkpoint_s: time between two checkpoints [s].
+        clock: function that returns the time for both and for the budget [s].
     """
 
     report_s: float = 1.0
@@ -568,13 +568,13 @@ class Pace:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FieldStep:
-    """How far training is.
+    """Progress of a training.
 
     Attributes:
-        progress: in seconds of the budget (or steps), with PSNR and time left in words.
-        psnr_full: on held-out images, over black [dB]; None until measured.
-        psnr_mask: the same inside the silhouettes, dilated by 2 px [dB].
-        preview: one held-out image: truth, ours, difference x 4; None between looks.
+        progress: seconds of the budget (or steps), with PSNR and time left in words.
+        psnr_full: PSNR on held-out images, over black [dB]; None until measured.
+        psnr_mask: PSNR inside the silhouettes, dilated by 2 px [dB]; None until measured.
+        preview: one held-out image: truth, rendering, difference x 4; None between measurements.
     """
 
     progress: Progress

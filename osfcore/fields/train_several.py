@@ -1,8 +1,8 @@
-"""Fields of several objects, each learned by itself, here or by any `concurrent.futures.Executor`.
+"""Training of several fields, here or by any `concurrent.futures.Executor`.
 
-Whatever trains them, weights and metrics are written by the process that asked for them: workers may be on other
-machines, which share nothing but the image sets. An object whose worker dies is trained again by an executor that can
-(Dask's does), or by the next run, which leaves alone what is finished: the metrics hold what it was made of.
+The calling process writes weights and metrics, because workers may be on other machines that share only the image sets.
+If a worker dies, its object is trained again: by the executor if it can (Dask's does), or by the next run. The next run
+skips finished fields; their metrics hold the settings that they were made with.
 """
 
 from __future__ import annotations
@@ -60,31 +60,32 @@ def train_several(
     threads: int = 1,
     shares_disk: bool = True,
 ) -> Iterator[Progress]:
-    """Train fields and write each when it is done; what an earlier run has made of the same is left as it is.
+    """Train fields, and write each once it is done. Fields that an earlier run finished the same way are kept.
 
     Args:
-        settings: of each training; no two write to one place.
-        train: the method, such as `train_field`; can be sent to other processes.
-        executor: trains them side by side, if given; else this process does, one after the other, in all its threads.
-        threads: of each training by the executor.
-        shares_disk: whether the executor's workers reach the outputs. Then checkpoints lie beside these, and what a
-            worker had begun when it died is gone on with.
+        settings: settings of each training, with different outputs.
+        train: training function, such as `train_field`, which executors must be able to pickle.
+        executor: pool that trains several fields at once; None to train one after the other in this process, with all
+            its threads.
+        threads: threads of each training by the executor.
+        shares_disk: whether the executor's workers can write to the outputs. Checkpoints then lie beside the outputs,
+            so that a training continues after its worker died.
 
     Yields:
-        Finished objects of all; in this process, with the seconds (or steps) of the one that is being trained.
+        Number of finished objects; in this process also the seconds (or steps) of the present one.
 
     Raises:
-        InvalidInput: if settings are out of range; raised before anything is trained.
-        CorruptFile: if a set is not sound; raised before, too. Or if nothing could be learned from it: by an executor,
-            raised when the others are done.
-        CannotWrite: if an output cannot be written, which is tried first.
-        WorkerDied: if a worker process ended; what was done until then is kept.
+        InvalidInput: if settings are out of range. This is checked before any training.
+        CorruptFile: if an image set is damaged, which is checked before any training, or if nothing could be learned
+            from it. An executor raises the latter once the others are done.
+        CannotWrite: if an output cannot be written, which is checked first.
+        WorkerDied: if a worker process died. Finished fields are kept.
     """
     missing = []
     for one in settings:
         yield Progress(0, len(settings), f"Reading the images of {one.out.stem}")
         next(train(replace(one, device="cpu")))  # refuses what cannot work; of devices, the worker knows
-        # Plain JSON of everything that a field depends on, wherever set and output lie.
+        # Plain JSON of everything that a field depends on, without the paths of image set and output.
         plain = {key: value for key, value in asdict(one).items() if key not in ("data", "out")}
         images = [images.digest() for images in read_splits(one.data)]
         training = _Training(one, {"settings": plain, "images": images})
@@ -111,7 +112,7 @@ def _read(out: Path) -> tuple[bytes, dict[str, Any]]:
 def _side_by_side(
     missing: Sequence[_Training], train: TrainOne, executor: Executor, threads: int, shares_disk: bool
 ) -> Iterator[str]:
-    """Yield in words what was reached, when an object is finished and kept."""
+    """Yield a note about the result each time an object is finished and written."""
     running: dict[Future[tuple[bytes, dict[str, Any]]], _Training] = {}
     failed: list[OsfError] = []
     try:
@@ -138,7 +139,7 @@ def _side_by_side(
 
 
 def _trained(settings: FieldSettings, train: TrainOne, threads: int, shares_disk: bool) -> tuple[bytes, dict[str, Any]]:
-    """Train in a worker, beside the output or where that may be out of reach; return weights and metrics."""
+    """Train in a worker, beside the output if that is within reach; return weights and metrics."""
     with TemporaryDirectory() as folder, computing_threads(threads):
         settings = settings if shares_disk else replace(settings, out=Path(folder) / settings.out.name)
         for _ in train(settings):

@@ -34,13 +34,13 @@ _EDGE_M = 0.02  # pixels that straddle the table's edge belong to nobody
 
 @dataclass(frozen=True, slots=True)
 class TrainTable:
-    """A training run.
+    """Settings of the training of a table's field.
 
     Attributes:
-        data: image set of the bare table; `train` is learned from, `test` measured on.
-        out: file to write, FILE.safetensors; metrics go beside it to FILE.json.
+        data: image set of the bare table, with `train` to learn from and `test` to measure on.
+        out: file to write, FILE.safetensors. Metrics go beside it to FILE.json.
         device: "auto", "cpu" or "cuda".
-        seed: of everything random.
+        seed: seed of everything random.
         iterations: steps of descent.
         rays: pixels per step.
     """
@@ -82,10 +82,10 @@ def train_table(config: TrainTable) -> Iterator[Progress]:
     """Train a table from an image set and write it.
 
     Raises:
-        InvalidInput: if a number is out of range, cuda is asked for and not there, the output file has another suffix,
-            or a file of somebody else lies where the metrics belong.
-        CorruptFile: if the image set is not sound or shows an object.
-        CannotWrite: if the output cannot be written, which is tried first.
+        InvalidInput: if a number is out of range, there is no GPU for "cuda", the output file has another suffix, or
+            another program's file lies in place of the metrics.
+        CorruptFile: if the image set is damaged or shows an object.
+        CannotWrite: if the output cannot be written, which is checked first.
     """
     device = pick_device(config.device)
     check_seed(config.seed)

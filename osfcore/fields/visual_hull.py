@@ -1,8 +1,8 @@
-"""Where the object is, from its silhouettes alone, and whether cameras and silhouettes agree at all.
+"""The place of an object from its silhouettes alone, and a check that cameras and silhouettes agree.
 
-Linear programs intersect the cones of the silhouettes' rectangles, which gives a region in the set's own unit of
-length; a coarse grid in it is then carved by the silhouettes themselves. Where cameras are right, what is left covers
-every silhouette; where their convention is misread, it does not, or nothing is left.
+Linear programs intersect the cones of the silhouettes' rectangles, which gives a region in the image set's own unit of
+length. The silhouettes then carve a coarse grid in this region. With right cameras, the rest covers every silhouette.
+With a misread camera convention it does not, or nothing is left.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class Hull:
     """The coarse visual hull of a set.
 
     Attributes:
-        box: least and greatest corner of what is left, in the set's unit; of the region searched if nothing is left.
-        occupied: which cells of the grid over the region searched are left; indices run along x, y, z.
-        cover: share of each silhouette that is covered by what is left.
-        is_bounded: whether the views enclose anything; also where they contradict each other.
+        box: least and greatest corner of the hull, in the set's unit; of the searched region if the hull is empty.
+        occupied: cells of the grid over the searched region that belong to the hull; indices run along x, y, z.
+        cover: share of each silhouette that the hull covers.
+        is_bounded: whether the views enclose a bounded region.
     """
 
     box: Float[np.ndarray, "2 3"]
@@ -54,12 +54,12 @@ def silhouette_box(*sets: ImageSet, where: Path | str = "The image set") -> Floa
     """Return the axis-aligned box of the object: least and greatest corner, in the set's unit of length.
 
     Args:
-        *sets: images of one object, each with a silhouette; the more, the tighter.
-        where: the set's folder, for messages.
+        *sets: images of one object, each with a silhouette. More images give a tighter box.
+        where: folder of the image set, for messages.
 
     Raises:
-        CorruptFile: if the views enclose nothing, silhouettes contradict each other (single culprits are named), or a
-            field could not hold an object of that size at that place.
+        CorruptFile: if the views enclose no bounded region, silhouettes contradict each other (single wrong ones are
+            named), or a field could not hold an object of that size at that place.
     """
     hull = carve(*sets)
     if not hull.is_bounded:
@@ -85,8 +85,8 @@ def silhouette_box(*sets: ImageSet, where: Path | str = "The image set") -> Floa
 def carve(*sets: ImageSet, resolution: int = 32) -> Hull:
     """Carve the visual hull on a grid of `resolution` cells a side, even from views that contradict each other.
 
-    Views are numbered through all sets, every image of which must have a silhouette. A cell stays where silhouettes
-    meet it: the hull errs on the large side by about a cell.
+    Views are numbered through all sets; each image must have a silhouette. A cell stays if all silhouettes meet it, so
+    that the hull is too large by up to about a cell.
     """
     views = [
         _View(camera, rgba[..., 3] >= OPAQUE, camera.intrinsics @ camera.T_world_camera.inverse().matrix()[:3])
@@ -115,14 +115,14 @@ def carve(*sets: ImageSet, resolution: int = 32) -> Hull:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _View:
-    """A silhouette and the matrix that brings world points to its pixels."""
+    """A silhouette, and the matrix that projects points in the world to its pixels."""
 
     camera: Camera
     mask: Bool[np.ndarray, "h w"]
     P: Float[np.ndarray, "3 4"]
 
     def project(self, points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return columns, rows [px] and depths; points behind the camera land outside of any image."""
+        """Return columns, rows [px] and depths. Points behind the camera are put outside of the image."""
         projected = points @ self.P[:, :3].T + self.P[:, 3]
         depth = projected[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -131,7 +131,7 @@ class _View:
         return np.floor(pixels[:, 0]).astype(np.int32), np.floor(pixels[:, 1]).astype(np.int32), depth
 
     def meets(self, centres: Float[np.ndarray, "n 3"], radius: float) -> Bool[np.ndarray, "n"]:
-        """Return whether balls around the centres meet the silhouette, or could beyond a border that it touches."""
+        """Return whether balls around the centres meet the silhouette, or may do so beyond a border that it touches."""
         height, width = self.mask.shape
         distance = cv2.distanceTransform(1 - self.mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         u, v, depth = self.project(centres)
@@ -158,8 +158,8 @@ class _View:
     def half_spaces(self) -> Float[np.ndarray, "k 4"]:
         """Return rows (n, d) with n x + d >= 0 for every point of the object: in front, within the mask's rectangle.
 
-        Beyond a border that the silhouette touches the object may go on: that side bounds nothing, nor do the two
-        sides across it.
+        The object may continue beyond an image border that the silhouette touches. That side then bounds nothing, nor
+        do the two adjacent sides.
         """
         height, width = self.mask.shape
         columns, rows = np.flatnonzero(self.mask.any(axis=0)), np.flatnonzero(self.mask.any(axis=1))
@@ -180,10 +180,10 @@ class _View:
 
 
 def _region(views: Sequence[_View]) -> tuple[Float[np.ndarray, "2 3"], bool]:
-    """Return a box around the intersection of the views' cones, and whether they enclose anything.
+    """Return a box around the intersection of the views' cones, and whether it is bounded.
 
-    Contradicting views are left out; where the rest encloses nothing, it is a box as large as the silhouettes around
-    the point at which the views look.
+    Contradicting views are left out. If the rest encloses no bounded region, the box is as large as the silhouettes,
+    around the point at which the views look.
     """
     origins = np.array([view.camera.T_world_camera.position for view in views])
     centre = origins.mean(axis=0)
@@ -205,7 +205,7 @@ def _region(views: Sequence[_View]) -> tuple[Float[np.ndarray, "2 3"], bool]:
 
 
 def _focus(planes: Sequence[Float[np.ndarray, "_ 4"]]) -> tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "n"]]:
-    """Return the point that violates the cones of the views least in sum, and which of them contain it."""
+    """Return the point with the least summed violation of the views' cones, and which cones contain it."""
     rows = np.concatenate(planes)
     owner = np.repeat(np.arange(len(planes)), [len(p) for p in planes])
     slack = sparse.csr_array((-np.ones(len(rows)), (np.arange(len(rows)), owner)), shape=(len(rows), len(planes)))
@@ -219,7 +219,7 @@ def _focus(planes: Sequence[Float[np.ndarray, "_ 4"]]) -> tuple[Float[np.ndarray
 
 
 def _bounds(rows: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "2 3"] | None:
-    """Return least and greatest coordinates where all half spaces meet; None where they do not."""
+    """Return the least and greatest coordinates of the intersection of half spaces; None if it is empty."""
     box = np.zeros((2, 3))
     for axis in range(3):
         for side, sign in enumerate((1, -1)):

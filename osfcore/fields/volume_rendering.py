@@ -52,7 +52,7 @@ def transmittance(taus: Float[Tensor, "rays samples"]) -> Float[Tensor, "rays sa
     """Return the share of the light that reaches each sample, T_i = exp(-sum of tau_j over j < i).
 
     Args:
-        taus: of samples in order of distance.
+        taus: optical thickness of each sample, in order of distance.
     """
     return torch.exp(-(torch.cumsum(taus, dim=1) - taus))
 
@@ -81,13 +81,13 @@ def composite(
     """Return the radiance over black and the opacity along rays that meet one object alone.
 
     Args:
-        query: what is looked at, a `KiloQuery` or an `OSF`: takes points, lights and views.
-        field: its density chooses the samples.
+        query: a `KiloQuery` or an `OSF`, called with points, lights and views.
+        field: field whose density chooses the samples.
         rays: R rays.
-        min_weight: samples that would contribute less are left out.
-        most: samples a ray at most.
-        offsets: of each ray's first sample, in steps; 1/2 by default.
-        device: where `query` computes.
+        min_weight: smallest weight of a sample that is kept.
+        most: largest number of samples per ray.
+        offsets: offsets of each ray's first sample, in steps; 1/2 by default.
+        device: device of `query`.
     """
     step = STEP_VOXELS * field.voxel
     ts, used = march(field, rays.origins, rays.directions, step=step, offsets=offsets, min_weight=min_weight,

@@ -30,17 +30,22 @@ def image_side(value: int, what: str = "image size [px]") -> int:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Camera:
-    """A pinhole camera with OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
+    """A pinhole camera with OpenCV axes: x right, y down, z forward. Pixel centres lie at +0.5.
 
     Attributes:
-        name: its name in files and pages.
+        name: name of the camera in files and on pages.
         T_world_camera: pose of the camera in the world.
-        intrinsics: focal lengths and principal point, 3 x 3 [px].
-        width: of the image [px].
-        height: of the image [px].
+        intrinsics: matrix K of focal lengths and principal point [px].
+        width: width of the image [px].
+        height: height of the image [px].
 
     Raises:
-        InvalidInput: if a side is outside 16 to 1024 px, or the intrinsics are no such matrix.
+        InvalidInput: if a side is outside 16 to 1024 px, or `intrinsics` is not such a matrix.
+
+    Example:
+        >>> camera = Camera.look_at("side", position=(0.6, 0.0, 0.5), target=(0, 0, 0.05))
+        >>> camera.project(np.array([0.0, 0.0, 0.05])).round(3)
+        array([64., 64.])
     """
 
     name: str
@@ -73,16 +78,16 @@ class Camera:
         """Return a camera with a square image that looks at a point.
 
         Args:
-            name: its name in files and pages.
-            position: of the optical centre in the world [m].
-            target: what appears in the middle of the image [m].
-            size: sides of the image [px].
+            name: name of the camera in files and on pages.
+            position: optical centre in the world [m], three numbers.
+            target: point in the world that appears in the middle of the image [m], three numbers.
+            size: side of the image [px].
             fov_y_deg: angle of view, vertical and horizontal [deg].
-            up: world direction that points upwards in the image; world y takes its place for a view along it, and
-                world z for a view along both.
+            up: direction in the world that points upwards in the image. If the camera looks along it, world y is
+                used instead; if it looks along world y as well, world z.
 
         Raises:
-            InvalidInput: if both points coincide or are not finite, or `size` is outside 16 to 1024.
+            InvalidInput: if the two points coincide or are not finite, or `size` is outside 16 to 1024.
         """
         origin = finite_vector(position, 3, f"position of camera {name} [m]")
         forward = finite_vector(target, 3, f"target of camera {name} [m]") - origin
@@ -104,17 +109,17 @@ class Camera:
         return float(2 * np.arctan2(self.height / 2, self.intrinsics[1, 1]))
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the same view with another number of pixels."""
+        """Return the same view with images of another size [px]."""
         scale = np.array([[width / self.width], [height / self.height], [1.0]])
         return replace(self, intrinsics=self.intrinsics * scale, width=width, height=height)
 
     def project(self, points_world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Return pixel coordinates of world points [px]; meaningless for points behind the camera."""
+        """Return pixel coordinates [px] of points in the world [m]. They mean nothing for points behind the camera."""
         points = self.T_world_camera.inverse().apply(points_world) @ self.intrinsics.T
         return points[..., :2] / points[..., 2:]
 
     def ray_directions(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
-        """Return unit directions in the world of the rays through pixel coordinates [px]."""
+        """Return unit vectors, in the world frame, along the rays through pixel coordinates [px]."""
         ones = np.ones((*pixels.shape[:-1], 1))
         directions = np.concatenate([pixels, ones], axis=-1) @ np.linalg.inv(self.intrinsics).T
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -122,24 +127,32 @@ class Camera:
 
 
 def default_cameras(size: int = DEFAULT_IMAGE_SIDE) -> tuple[Camera, ...]:
-    """Return the cameras "0" to "3" around the table.
+    """Return the four cameras "0" to "3" around the table, which an episode observes with.
 
     Args:
-        size: sides of the images [px].
+        size: side of the images [px].
 
     Raises:
-        InvalidInput: if it is outside 16 to 1024.
+        InvalidInput: if `size` is outside 16 to 1024.
+
+    Example:
+        >>> [camera.name for camera in default_cameras(size=64)]
+        ['0', '1', '2', '3']
     """
     return tuple(Camera.look_at(str(i), p, SCENE_CENTRE, size=size) for i, p in enumerate(CAMERA_POSITIONS))
 
 
 def goal_camera(size: int = DEFAULT_IMAGE_SIDE) -> Camera:
-    """Return the camera "goal", from which goal images are taken.
+    """Return the camera "goal", which takes goal images.
 
     Args:
-        size: sides of the image [px].
+        size: side of the image [px].
 
     Raises:
-        InvalidInput: if it is outside 16 to 1024.
+        InvalidInput: if `size` is outside 16 to 1024.
+
+    Example:
+        >>> goal_camera().T_world_camera.position
+        array([ 0.  , -0.45,  0.8 ])
     """
     return Camera.look_at("goal", GOAL_CAMERA_POSITION, SCENE_CENTRE, size=size)

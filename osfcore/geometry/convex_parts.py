@@ -25,7 +25,7 @@ def convex_parts(
     Bodies with shallow dents only, such as cans, are one part: coacd would spend many on the rim of a lid.
 
     Args:
-        vertices: of a mesh in the object frame [m].
+        vertices: vertices of a mesh in the object frame [m].
         faces: its triangles; holes are closed first.
 
     Raises:

@@ -16,13 +16,18 @@ MIN_LIGHT_ELEVATION_DEG = 5.0
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Light:
-    """A distant, parallel, white light; only its direction can be observed.
+    """A distant white light with parallel rays. Images show only its direction.
 
     Attributes:
-        position: 1 m from the table's centre, toward the light [m]; other lengths are brought to 1 m.
+        position: point in the direction of the light, seen from the table's centre [m]. It is scaled to a length of
+            1 m.
 
     Raises:
-        InvalidInput: if it is zero, not finite, or less than 5 degrees above the table.
+        InvalidInput: if the position is zero, not finite, or less than 5 degrees above the table.
+
+    Example:
+        >>> Light(np.array([0.0, 3.0, 4.0])).direction
+        array([0. , 0.6, 0.8])
     """
 
     position: Float[np.ndarray, "3"]
@@ -39,13 +44,13 @@ class Light:
 
     @staticmethod
     def from_angles(azimuth_rad: float, elevation_rad: float) -> Light:
-        """Return a light at an azimuth from +x toward +y and an elevation above the table [rad]."""
+        """Return the light at an azimuth [rad], from +x toward +y, and an elevation above the table [rad]."""
         c = np.cos(elevation_rad)
         return Light(np.array([c * np.cos(azimuth_rad), c * np.sin(azimuth_rad), np.sin(elevation_rad)]))
 
     @staticmethod
     def random(rng: np.random.Generator, min_elevation_deg: float = 10.0) -> Light:
-        """Draw a light uniformly (by solid angle) from the hemisphere above `min_elevation_deg`."""
+        """Draw a light above `min_elevation_deg`, uniformly by solid angle."""
         z = rng.uniform(np.sin(np.deg2rad(min_elevation_deg)), 1.0)
         return Light.from_angles(rng.uniform(-np.pi, np.pi), float(np.arcsin(z)))
 

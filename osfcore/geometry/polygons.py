@@ -20,7 +20,7 @@ class Gap(NamedTuple):
     Attributes:
         distance: between the two [m]; negative where they overlap.
         normal: unit vector out of the outline, toward the other.
-        point: of the outline, where the two are closest [m].
+        point: point of the outline, where the two are closest [m].
     """
 
     distance: Float[Tensor, "A"]

@@ -86,11 +86,18 @@ def quaternion_log(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batc
 def rotation_angle(
     a: Float[np.ndarray, "*#batch 4"], b: Float[np.ndarray, "*#batch 4"]
 ) -> Float[np.ndarray | np.float64, "*out"]:
-    """Angle of the rotation between two orientations [rad], in [0, pi]; q and -q are the same orientation.
+    """Return the angle of the rotation between two orientations [rad], in [0, pi].
+
+    q and -q are the same orientation.
 
     Args:
         a: unit quaternions (w, x, y, z).
-        b: likewise; batches broadcast.
+        b: unit quaternions (w, x, y, z). The batches of a and b broadcast.
+
+    Example:
+        >>> upright, upside_down = np.array([1.0, 0, 0, 0]), np.array([0, 1.0, 0, 0])
+        >>> round(float(np.rad2deg(rotation_angle(upright, upside_down))))
+        180
     """
     difference = quaternion_multiply(quaternion_conjugate(a), b)
     return 2.0 * np.arctan2(np.linalg.norm(difference[..., 1:], axis=-1), np.abs(difference[..., 0]))
@@ -129,11 +136,18 @@ def unit_quaternion(q: Float[np.ndarray, "*batch 4"], what: str = "quaternion") 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Pose:
-    """A rigid pose, or a batch of them; `T_a_b` maps coordinates in b to coordinates in a.
+    """A rigid pose `T_a_b`, or a batch of them: it maps coordinates in frame b to coordinates in frame a.
+
+    Poses compose by matching frames: `T_a_b @ T_b_c` is `T_a_c`.
 
     Attributes:
         position: origin of b in a [m].
-        quaternion: rotation from b to a, unit, (w, x, y, z).
+        quaternion: rotation from b to a as a unit quaternion (w, x, y, z).
+
+    Example:
+        >>> T_world_object = Pose(np.array([0.1, 0.0, 0.05]), np.array([1.0, 0, 0, 0]))
+        >>> T_world_object.apply(np.array([0.0, 0.0, 0.02])).round(3)
+        array([0.1 , 0.  , 0.07])
     """
 
     position: Float[np.ndarray, "*batch 3"]
@@ -141,7 +155,7 @@ class Pose:
 
     @staticmethod
     def identity(*batch: int) -> Pose:
-        """The pose that changes nothing."""
+        """Return the identity, or a batch of identities of this shape."""
         quaternion = np.zeros((*batch, 4))
         quaternion[..., 0] = 1.0
         return Pose(np.zeros((*batch, 3)), quaternion)
@@ -153,7 +167,7 @@ class Pose:
 
     @staticmethod
     def stacked(poses: Iterable[Pose]) -> Pose:
-        """Stack poses, or batches of one size, along a new first axis; no poses give a batch of 0."""
+        """Stack poses, or batches of one size, along a new first axis. No poses give an empty batch."""
         every = list(poses)
         if not every:
             return Pose.identity(0)
@@ -161,12 +175,12 @@ class Pose:
 
     @staticmethod
     def from_matrix(matrix: Float[np.ndarray, "*batch 4 4"]) -> Pose:
-        """The pose of homogeneous 4 x 4 matrices whose upper left block is a rotation."""
+        """Return the poses of homogeneous 4 x 4 matrices, whose upper left 3 x 3 block must be a rotation."""
         matrix = np.asarray(matrix, float)
         return Pose(matrix[..., :3, 3].copy(), quaternion_from_matrix(matrix[..., :3, :3]))
 
     def matrix(self) -> Float[np.ndarray, "*batch 4 4"]:
-        """Homogeneous 4 x 4 matrices."""
+        """Return the pose as homogeneous 4 x 4 matrices."""
         matrix = np.zeros((*self.position.shape[:-1], 4, 4))
         matrix[..., :3, :3] = quaternion_to_matrix(self.quaternion)
         matrix[..., :3, 3] = self.position
@@ -174,23 +188,23 @@ class Pose:
         return matrix
 
     def inverse(self) -> Pose:
-        """`T_b_a` of `T_a_b`."""
+        """Return `T_b_a`, the inverse of `T_a_b`."""
         quaternion = quaternion_conjugate(self.quaternion)
         return Pose(-rotate(quaternion, self.position), quaternion)
 
     def __matmul__(self, other: Pose) -> Pose:
-        """`T_a_b @ T_b_c` is `T_a_c`. Batches broadcast."""
+        """Return `T_a_c = T_a_b @ T_b_c`. Batches broadcast."""
         return Pose(
             self.position + rotate(self.quaternion, other.position),
             quaternion_multiply(self.quaternion, other.quaternion),
         )
 
     def apply(self, points: Float[np.ndarray, "*points 3"]) -> Float[np.ndarray, "*out 3"]:
-        """Map points from b to a [m]. One pose maps any array of points; a batch broadcasts against them."""
+        """Map points from frame b to frame a [m]. One pose maps any array of points; a batch broadcasts with them."""
         return rotate(self.quaternion, points) + self.position
 
     def __getitem__(self, index: object) -> Pose:
-        """Poses of a batch."""
+        """Return some poses of a batch, by index, slice or list."""
         return Pose(self.position[index], self.quaternion[index])  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 

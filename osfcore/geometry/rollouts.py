@@ -17,13 +17,15 @@ MAX_SEQUENCES = 20_000
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rollouts:
-    """Predicted futures of one scene: K action sequences of T steps.
+    """Predicted futures of one scene under K sequences of T actions.
+
+    The second axis of the arrays is time. It has T1 = T + 1 entries: before the first action and after each action.
 
     Attributes:
-        names: of the N objects.
-        positions: of the objects, before the first and after each action [m].
-        quaternions: likewise, (w, x, y, z).
-        pusher: centre of the pusher, likewise [m].
+        names: names of the N objects.
+        positions: positions of the objects in the world [m].
+        quaternions: orientations of the objects in the world, (w, x, y, z).
+        pusher: centre of the pusher in the world [m].
     """
 
     names: tuple[str, ...]
@@ -32,20 +34,20 @@ class Rollouts:
     pusher: Float[np.ndarray, "K T1 3"]
 
     def __getitem__(self, sequence: int) -> Rollouts:
-        """Return one sequence alone, K = 1."""
+        """Return one future alone, with K = 1."""
         k = slice(sequence, sequence + 1)
         return Rollouts(self.names, self.positions[k], self.quaternions[k], self.pusher[k])
 
     @staticmethod
     def joined(parts: Sequence[Rollouts]) -> Rollouts:
-        """Join futures of the same scene along K."""
+        """Join futures of the same scene along the first axis."""
         positions, quaternions, pusher = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("positions", "quaternions", "pusher")
         )
         return Rollouts(parts[0].names, positions, quaternions, pusher)
 
     def after(self, actions: int) -> Rollouts:
-        """Return the rest of the futures after some actions; at least the last state."""
+        """Return the futures from the given number of actions on. The last state is always kept."""
         t = slice(min(actions, self.positions.shape[1] - 1), None)
         return Rollouts(self.names, self.positions[:, t], self.quaternions[:, t], self.pusher[:, t])
 

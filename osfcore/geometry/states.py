@@ -22,16 +22,22 @@ MAX_OBJECTS = 8
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneState:
-    """Where everything is: objects, light, pusher.
+    """Poses of the objects, the light, and the position of the pusher.
 
     Attributes:
-        names: catalogue names of the objects, all different.
+        names: names of the N objects, all different; 8 at most.
         poses: `T_world_object`, a batch of N.
-        light: the one light.
-        pusher: centre of the pusher [m], or None where there is none (goal images).
+        light: the light.
+        pusher: centre of the pusher in the world [m]; None for a scene without one, such as a goal image.
 
     Raises:
-        InvalidInput: if there are too many objects, one comes twice, or a number is not finite or of another shape.
+        InvalidInput: if there are more than 8 objects, a name occurs twice, a number is not finite, a quaternion is
+            not unit, or an array has another shape.
+
+    Example:
+        >>> state = SceneState((name,), Pose.stacked([upright]), light, pusher)
+        >>> state.pose(name).position
+        array([0.   , 0.   , 0.095])
     """
 
     names: tuple[str, ...]
@@ -53,10 +59,10 @@ class SceneState:
             object.__setattr__(self, "pusher", finite_vector(self.pusher, 3, "pusher position [m]"))
 
     def pose(self, name: str) -> Pose:
-        """`T_world_object` of one object.
+        """Return `T_world_object` of one object.
 
         Raises:
-            UnknownName: if it is not in the scene.
+            UnknownName: if the object is not in the scene.
         """
         return self.poses[self._number(name)]
 
@@ -64,7 +70,7 @@ class SceneState:
         """Return the same state with its objects in another order.
 
         Raises:
-            UnknownName: if one of them is not in the scene.
+            UnknownName: if a name is not in the scene.
         """
         return replace(self, names=names, poses=self.poses[[self._number(name) for name in names]])
 
@@ -83,15 +89,20 @@ def shifted_poses(state: SceneState, shifts_m: Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """The report of cameras and robot at one instant: no depth, no poses.
+    """Images and pusher position at one instant. It holds no depth and no poses.
 
     Attributes:
         cameras: V cameras of one image size.
         images: linear RGB in [0, 1].
         names: names of the N objects in the scene.
-        masks: visible pixels of each object, or None.
-        pusher: centre of the pusher [m]; the robot knows its hand.
-        time_s: since the last reset [s].
+        masks: visible pixels of each object, or None. Only a first frame needs masks.
+        pusher: centre of the pusher in the world [m], as the robot reports it; None without a pusher.
+        time_s: time since the last reset [s].
+
+    Example:
+        >>> observation = Observation(cameras, images, state.names, masks, pusher, time_s=0.0)
+        >>> observation.images.shape, observation.masks.shape
+        ((4, 128, 128, 3), (4, 1, 128, 128))
     """
 
     cameras: tuple[Camera, ...]
@@ -103,10 +114,9 @@ class Observation:
 
 
 def pose_rows(poses: Pose) -> Float[np.ndarray, "N 7"]:
-    """Return position [m] and quaternion (w, x, y, z) of each object, as programs that learn get them.
+    """Return position [m] and quaternion (w, x, y, z) of each object, as learning programs receive them.
 
-    Of q and -q, which are one rotation, the one with w >= 0 is given. Positions of objects that have fallen off the
-    table are clipped to 1.2 m around its centre.
+    Quaternions have w >= 0. Positions of objects that have fallen off the table are clipped to 1.2 m around its centre.
     """
     signs = np.where(poses.quaternion[:, :1] < 0, -1.0, 1.0)
     positions = poses.position.clip(-TABLE_SIDE_M, TABLE_SIDE_M)
@@ -115,15 +125,15 @@ def pose_rows(poses: Pose) -> Float[np.ndarray, "N 7"]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class EstimatedState:
-    """A scene state as estimated, with its uncertainty and whether to act on it.
+    """An estimated scene state, its uncertainty, and whether to trust it.
 
     Attributes:
         state: the most likely state.
         position_std: standard deviation of each object's position, per axis [m].
-        rotation_std: of each object's orientation, per axis of a small rotation [rad].
-        light_std: of the direction toward the light, per axis [rad].
-        doubts: for each object why it should not be trusted; "" if it can be.
-        reason: why the whole should not be trusted, in a sentence; "" if it can be.
+        rotation_std: standard deviation of each object's orientation, per axis of a small rotation [rad].
+        light_std: standard deviation of the direction toward the light, per axis [rad].
+        doubts: for each object, why its pose should not be trusted; "" if it can be.
+        reason: why the estimate should not be trusted, in one sentence; "" if it can be.
     """
 
     state: SceneState
@@ -147,7 +157,7 @@ class EstimatedState:
 
     @property
     def trusted(self) -> bool:
-        """Whether to act on it."""
+        """Whether the estimate can be trusted."""
         return not self.reason
 
     @property
@@ -156,5 +166,5 @@ class EstimatedState:
         return tuple(name for name, doubt in zip(self.state.names, self.doubts, strict=True) if doubt)
 
     def with_pusher(self, pusher: Float[np.ndarray, "3"] | None) -> EstimatedState:
-        """Return the same with the pusher where the robot reports it [m]."""
+        """Return the same estimate with the pusher at this position in the world [m]."""
         return replace(self, state=replace(self.state, pusher=pusher))

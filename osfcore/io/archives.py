@@ -1,4 +1,4 @@
-"""Unpack a zip that somebody gave us, such as an image set or observation, without trusting anything in it."""
+"""Safe unpacking of zip archives from others, such as image sets and observations."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ _SMALL_DIRECTORY_BYTES = 1 << 16  # below this no list hurts
 
 
 def _check_directory(archive: BinaryIO, max_files: int) -> None:
-    """Refuse a zip whose list of files is too large or too long, whatever the archive claims of it.
+    """Check the size of a zip's list of files, without trusting the sizes that the archive states.
 
-    The list is sought where `zipfile` seeks it. A damaged one passes here, for `zipfile` refuses it.
+    The list is read where `zipfile` reads it. A damaged list passes here, because `zipfile` refuses it.
 
     Args:
-        archive: a whole file, open for reading.
-        max_files: that the list may hold.
+        archive: the complete file, open for reading.
+        max_files: largest number of files in the list.
 
     Raises:
-        CorruptFile: if it is larger or longer, or if there are two.
+        CorruptFile: if the list is too large or too long, or if there are two lists.
     """
     start, size = _find_directory(archive)
     if start < 0:
@@ -54,7 +54,7 @@ def _check_directory(archive: BinaryIO, max_files: int) -> None:
 
 
 def _find_directory(archive: BinaryIO) -> tuple[int, int]:
-    """Return where the list of files starts and how long it is [bytes]; the start is negative if there is none."""
+    """Return start and length of the list of files [bytes]. The start is negative if there is no list."""
     size = archive.seek(0, os.SEEK_END)
     archive.seek(max(size - _COMMENT_BYTES - _END_BYTES, 0))
     tail = archive.read()
@@ -102,11 +102,11 @@ class ArchiveKind:
     """What an archive may hold.
 
     Attributes:
-        what: its name in messages.
-        marker: a file by which its place in the archive is found.
-        kept: the folders that belong to it; all that lies beside the marker if empty.
-        expected: what should have been given, for messages.
-        max_depth: of folders in it.
+        what: name of the kind in messages.
+        marker: file that marks the right folder in the archive.
+        kept: folders that are unpacked; everything beside the marker if empty.
+        expected: description of a right archive, for messages.
+        max_depth: largest depth of folders in it.
     """
 
     what: str
@@ -125,23 +125,24 @@ _OBSERVATION = ArchiveKind(
 
 
 def unpack_set(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
-    """Unpack the train and test folders of an image set as `out`/train and `out`/test; in the zip they may lie deeper.
+    """Unpack the train and test folders of an image set to `out`/train and `out`/test. In the zip they may lie deeper.
 
-    Everything is looked at before anything is written, and `out` appears only when all is there. `read_splits` checks
-    the set itself.
+    Everything is checked before anything is written, and `out` appears only once it is complete. `read_splits` checks
+    the image set itself.
 
     Args:
         archive: a .zip file.
         out: folder to write; must not exist or be empty.
-        max_bytes: of the unpacked archive.
-        max_files: in the archive, folders and what is left packed included.
+        max_bytes: largest size of the unpacked archive.
+        max_files: largest number of entries in the archive, including folders.
 
     Returns:
         `out`, the folder that holds train/anno.json.
 
     Raises:
-        CorruptFile: if it is no zip, damaged, locked, a bomb, holds no set, or has names that lead elsewhere or links.
-        InvalidInput: if `out` is there and not empty.
+        CorruptFile: if it is no zip, is damaged, locked or a zip bomb, holds no image set, or has links or names that
+            lead out of it.
+        InvalidInput: if `out` exists and is not empty.
         CannotWrite: if the disk is full or cannot be written.
     """
     return unpack(archive, out, _IMAGE_SET, max_bytes, max_files)
@@ -153,7 +154,7 @@ def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, 
 
 
 def check_zip(archive: Path, max_files: int = MAX_FILES) -> None:
-    """Refuse what is no zip at all, or lists too much, without unpacking anything: this takes milliseconds.
+    """Check within milliseconds, without unpacking, that a file is a zip with few enough files.
 
     Raises:
         CorruptFile: if it is no zip archive, or holds more than `max_files` files.
@@ -164,7 +165,7 @@ def check_zip(archive: Path, max_files: int = MAX_FILES) -> None:
 
 @contextlib.contextmanager
 def _opened(archive: Path, max_files: int) -> Iterator[zipfile.ZipFile]:
-    """Open a zip whose list of files is not too long, and raise damage that is found in it as `CorruptFile`."""
+    """Open a zip whose list of files is not too long; raise damage in it as `CorruptFile`."""
     try:
         with archive.open("rb") as raw:
             _check_directory(raw, max_files)
@@ -181,21 +182,22 @@ def _opened(archive: Path, max_files: int) -> Iterator[zipfile.ZipFile]:
 
 
 def unpack(archive: Path, out: Path, kind: ArchiveKind, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
-    """Unpack what belongs to a kind of archive, under the same guards.
+    """Unpack the contents of one kind of archive, with the same checks.
 
     Args:
         archive: a .zip file.
         out: folder to write; must not exist or be empty.
-        kind: what it has to hold.
-        max_bytes: of the unpacked archive.
-        max_files: in the archive.
+        kind: kind of archive.
+        max_bytes: largest size of the unpacked archive.
+        max_files: largest number of files in the archive.
 
     Returns:
         `out`, the folder that holds the marker.
 
     Raises:
-        CorruptFile: if it is no zip, damaged, locked, a bomb, of another kind, or leads elsewhere.
-        InvalidInput: if `out` is there and not empty.
+        CorruptFile: if it is no zip, is damaged, locked or a zip bomb, of another kind, or has names that lead out of
+            it.
+        InvalidInput: if `out` exists and is not empty.
         CannotWrite: if the disk is full or cannot be written.
     """
     archive, out = Path(archive), new_folder(out)
@@ -210,7 +212,7 @@ def unpack(archive: Path, out: Path, kind: ArchiveKind, max_bytes: int = MAX_BYT
 def _members(
     archive: Path, file: zipfile.ZipFile, kind: ArchiveKind, max_bytes: int
 ) -> dict[PurePosixPath, zipfile.ZipInfo]:
-    """Return the plain files of an archive by their path, all of which lead inside."""
+    """Return the plain files of an archive by their paths, none of which leads out of it."""
     infos = file.infolist()
     size = sum(info.file_size for info in infos)
     if size > max_bytes:
@@ -252,7 +254,7 @@ def _safe_path(archive: Path, info: zipfile.ZipInfo, max_depth: int) -> PurePosi
 def _wanted(
     archive: Path, members: Mapping[PurePosixPath, zipfile.ZipInfo], kind: ArchiveKind
 ) -> dict[PurePosixPath, zipfile.ZipInfo]:
-    """Return what lies beside the marker and is to be kept, by its path from there."""
+    """Return the files to keep, by their paths from the marker's folder."""
     depth = len(kind.marker.parts)
     roots = [p.parents[depth - 1] for p in members if PurePosixPath(*p.parts[-depth:]) == kind.marker]
     if not roots:

@@ -15,17 +15,18 @@ from torch import Tensor, nn
 from osfcore.errors import CorruptFile, shown
 from osfcore.io.files import write_atomically
 
-# A training starts over where its checkpoint is missing, cut short or of another run. A checkpoint of the same run
-# that cannot be restored ends it: a run restored by half would learn something else, and starting over would lose work.
+# A training starts over if its checkpoint is missing, truncated, or of another run. If a checkpoint of the same run
+# cannot be restored, the training ends: a partly restored run would learn something else, and starting over would lose
+# work.
 
 _MOST_CHARACTERS = 100  # of what PyTorch says
 
 
 def write_checkpoint(path: Path, fingerprint: object, content: Mapping[str, Any]) -> None:
-    """Write what a run needs to go on; the former checkpoint stays until this one is whole.
+    """Write a checkpoint. The former checkpoint stays until this one is complete.
 
     Args:
-        path: of the file.
+        path: path of the file.
         fingerprint: settings and data of the run.
         content: tensors, numbers, words, and lists and dicts of them.
 
@@ -38,10 +39,10 @@ def write_checkpoint(path: Path, fingerprint: object, content: Mapping[str, Any]
 
 
 def read_content(path: Path, fingerprint: object) -> dict[str, Any] | None:
-    """Return what a run has written to go on, in main memory; None if missing, cut short or of another run.
+    """Return the contents of a checkpoint, in main memory; None if it is missing, truncated or of another run.
 
     Raises:
-        CorruptFile: if there is a file, but it cannot be read at all.
+        CorruptFile: if the file exists but cannot be read.
     """
     try:
         data = path.read_bytes()
@@ -60,7 +61,7 @@ def read_content(path: Path, fingerprint: object) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def going_on_from(path: Path) -> Iterator[None]:
-    """Raise whatever goes wrong while a checkpoint of this run is restored as `CorruptFile`.
+    """Turn errors while a checkpoint of this run is restored into `CorruptFile`.
 
     Raises:
         CorruptFile: for any error other than a lack of memory.
@@ -76,15 +77,15 @@ def going_on_from(path: Path) -> Iterator[None]:
 
 
 def resume_from(path: Path, fingerprint: object, restore: Callable[[dict[str, Any]], None]) -> None:
-    """Go on from a checkpoint of the same run; a run whose checkpoint is missing, cut short or old starts over.
+    """Continue from a checkpoint of the same run. Without a usable checkpoint, the run starts over.
 
     Args:
-        path: of the file.
-        fingerprint: must be that of the checkpoint.
-        restore: gets the content, which lies in main memory.
+        path: path of the file.
+        fingerprint: settings and data of the run, which the checkpoint must agree with.
+        restore: function that receives the contents, in main memory.
 
     Raises:
-        CorruptFile: if the checkpoint cannot be read or restored; what `restore` was to change is then of no use.
+        CorruptFile: if the checkpoint cannot be read or restored. The objects that `restore` changes are then unusable.
     """
     content = read_content(path, fingerprint)
     if content is not None:
@@ -96,12 +97,12 @@ def read_parameters(path: Path, expected: str, what: str) -> tuple[Mapping[str, 
     """Return metadata and finite parameters of a safetensors file of the expected format.
 
     Args:
-        path: of the file.
+        path: path of the file.
         expected: format that the metadata must name.
         what: kind of network, for messages.
 
     Raises:
-        CorruptFile: if the file is missing, cut short, of another format, or holds what is not finite.
+        CorruptFile: if the file is missing, truncated, of another format, or has values that are not finite.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -117,10 +118,10 @@ def read_parameters(path: Path, expected: str, what: str) -> tuple[Mapping[str, 
 
 
 def load_parameters(network: nn.Module, values: Mapping[str, Tensor], path: Path) -> None:
-    """Give a network the parameters of a file.
+    """Load the parameters of a file into a network.
 
     Raises:
-        CorruptFile: if they are not those of such a network.
+        CorruptFile: if they do not fit the network.
     """
     try:
         network.load_state_dict(values)

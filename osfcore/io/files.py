@@ -1,8 +1,7 @@
-"""Write files that are whole or not there, and read JSON with its errors as one sentence.
+"""Atomic writing of files, and reading of JSON with errors in one sentence.
 
-A rename alone is not enough: after a power failure the disk may have kept the new name and lost what was written under
-it, or the other way round. So contents are synced before they take their name, and the name is synced before the
-caller goes on.
+A rename alone is not enough: after a power failure the disk may have the new name without the contents, or the contents
+without the name. So the contents are synced before the rename, and the name is synced before the caller continues.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ T = TypeVar("T")
 
 @contextlib.contextmanager
 def writing(place: Path) -> Iterator[None]:
-    """Raise what the disk refuses as `CannotWrite` of a place."""
+    """Turn errors of the disk into `CannotWrite`."""
     try:
         yield
     except OSError as error:
@@ -41,7 +40,7 @@ def writing(place: Path) -> Iterator[None]:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's contents, or a folder's list of names where the system allows that, are on the disk."""
+    """Wait until a file's contents are on the disk, or a folder's list of names if the system supports that."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except PermissionError:
@@ -58,7 +57,7 @@ def sync(path: Path) -> None:
 
 
 def sync_tree(made: Path) -> None:
-    """Wait until a file, or a folder with all that is in it, is on the disk."""
+    """Wait until a file, or a folder with everything in it, is on the disk."""
     for folder, _, names in os.walk(made):
         for name in names:
             sync(Path(folder, name))
@@ -68,10 +67,10 @@ def sync_tree(made: Path) -> None:
 
 
 def put_in_place(made: Path, place: Path) -> None:
-    """Rename a file or folder to where it counts as there; on return it outlives a power failure.
+    """Rename a file or folder to its final name. On return, it survives a power failure.
 
     Raises:
-        OSError: if the disk refuses; then it is not in place, or not for certain.
+        OSError: if the disk refuses. The file may then not be in place.
     """
     _rename(made, place)
     sync(place.parent.parent)  # the folder itself may be new
@@ -79,13 +78,12 @@ def put_in_place(made: Path, place: Path) -> None:
 
 @contextlib.contextmanager
 def file_at_once(path: Path) -> Iterator[Path]:
-    """Give a new file beside `path` to fill, which takes that name only when it is whole and on the disk.
+    """Yield a new file beside `path` to write to. It gets that name once it is complete and on the disk.
 
-    Any number of threads and processes may write to the same path: each has a file of its own, and the last one stays.
+    Several threads and processes may write to the same path: each has its own file, and the last one stays.
 
     Raises:
-        CannotWrite: if there is no such folder, or the disk refuses, here or while the file is filled; what was there
-            before is untouched.
+        CannotWrite: if the folder does not exist, or the disk refuses. An older file is then unchanged.
     """
     partial = _beside(path)
     try:
@@ -99,10 +97,10 @@ def file_at_once(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write bytes by `file_at_once`, and make the folder if there is none.
+    """Write bytes with `file_at_once`. The folder is created if it does not exist.
 
     Raises:
-        CannotWrite: if the disk refuses; what was there before is untouched.
+        CannotWrite: if the disk refuses. An older file is then unchanged.
     """
     _make_folder(path.parent, path)
     with file_at_once(path) as partial:
@@ -122,7 +120,7 @@ def new_folder(out: Path) -> Path:
     """Return the absolute path of an output folder.
 
     Raises:
-        InvalidInput: if there is something in its place other than an empty folder.
+        InvalidInput: if the path exists and is not an empty folder.
     """
     out = Path(out).absolute()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -132,9 +130,9 @@ def new_folder(out: Path) -> Path:
 
 @contextlib.contextmanager
 def folder_at_once(out: Path) -> Iterator[Path]:
-    """Give a folder beside `out` to fill, which takes that name only when everything is there and on the disk.
+    """Yield a folder beside `out` to fill. It gets that name once it is complete and on the disk.
 
-    `out` may be an empty folder. Errors of whoever fills it pass as they are.
+    `out` may be an empty folder. Errors of the caller pass unchanged.
 
     Raises:
         CannotWrite: if the disk refuses the folder.
@@ -152,12 +150,13 @@ def folder_at_once(out: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def scratch_folder(parent: Path, prefix: str, life_s: float) -> Iterator[Path]:
-    """Give a folder inside `parent` that is gone afterwards.
+    """Yield a folder inside `parent` that is deleted afterwards.
 
     Args:
-        parent: made if it is not there.
-        prefix: of the folder's name.
-        life_s: folders of this prefix that have not changed for so long were left by a killed process, and go too [s].
+        parent: folder, which is created if it does not exist.
+        prefix: prefix of the folder's name.
+        life_s: age of the last change from which other folders with this prefix are deleted as well, because a killed
+            process left them [s].
     """
     parent.mkdir(parents=True, exist_ok=True)
     for path in parent.glob(f"{prefix}*"):
@@ -172,10 +171,10 @@ def scratch_folder(parent: Path, prefix: str, life_s: float) -> Iterator[Path]:
 
 
 def replace_folder(made: Path, place: Path) -> None:
-    """Put a folder in place of an older one, if there is one; on return it outlives a power failure.
+    """Put a folder in place of an older one, if there is one. On return, it survives a power failure.
 
-    Several processes may put a folder there at the same time; the last one stays. What was there is moved beside
-    `made`, for the caller to delete.
+    Several processes may do this at the same time; the last folder stays. The older folder is moved beside `made`, for
+    the caller to delete.
 
     Raises:
         OSError: if the disk refuses.
@@ -194,10 +193,10 @@ def replace_folder(made: Path, place: Path) -> None:
 
 
 def remove_folder(folder: Path) -> None:
-    """Delete a folder in one piece; on return it is gone for good, also after a power failure.
+    """Delete a folder atomically. On return, it is gone even after a power failure.
 
     Raises:
-        OSError: if the disk refuses; then it is in place, or not for certain.
+        OSError: if the disk refuses. The folder may then still be in place.
     """
     aside = _beside(folder)
     folder.rename(aside)
@@ -206,7 +205,7 @@ def remove_folder(folder: Path) -> None:
 
 
 def _make_folder(folder: Path, wanted: Path) -> None:
-    """Make a folder, and those around it, for what is wanted."""
+    """Create a folder and its parents."""
     if not folder.is_dir():
         with writing(wanted):
             folder.mkdir(parents=True, exist_ok=True)
@@ -214,19 +213,19 @@ def _make_folder(folder: Path, wanted: Path) -> None:
 
 
 def _rename(made: Path, place: Path) -> None:
-    """Give what is made its name, once all of it is on the disk; then put the name there, too."""
+    """Rename a file or folder once its contents are on the disk; then sync the name."""
     sync_tree(made)
     made.replace(place)
     sync(place.parent)
 
 
 def _beside(path: Path) -> Path:
-    """Return a name that nobody else takes, in the same folder."""
+    """Return a unique name in the same folder."""
     return path.parent / f".{path.name}.{secrets.token_hex(6)}"
 
 
 def read_json(path: Path, parse: Callable[[object], T]) -> T:
-    """Return what `parse` makes of a JSON file.
+    """Return the result of `parse` for the contents of a JSON file.
 
     Raises:
         CorruptFile: if it cannot be read, is not JSON, or `parse` raises an OsfError; the message says why.
@@ -254,10 +253,10 @@ def read_json(path: Path, parse: Callable[[object], T]) -> T:
 
 
 def as_mapping(data: object) -> dict[str, Any]:
-    """Return parsed JSON that is an object.
+    """Check that parsed JSON is an object, and return it.
 
     Raises:
-        InvalidInput: if it is something else.
+        InvalidInput: if it is not.
     """
     if not isinstance(data, dict):
         raise InvalidInput("content", shown(repr(data)), "a JSON object")
@@ -265,7 +264,7 @@ def as_mapping(data: object) -> dict[str, Any]:
 
 
 def is_text(name: str) -> bool:
-    """Whether a name can be written at all: JSON may hold halves of characters."""
+    """Return whether a name can be encoded: JSON may hold lone surrogates."""
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -274,12 +273,12 @@ def is_text(name: str) -> bool:
 
 
 def is_file_name(name: object) -> TypeGuard[str]:
-    """Whether a value of a file can be the name of a file at all."""
+    """Return whether a value of a file can be a file name."""
     return isinstance(name, str) and bool(name) and "\0" not in name and is_text(name)
 
 
 def leads_out(folder: Path, path: Path) -> bool:
-    """Whether a path is a link that leads out of a folder."""
+    """Return whether a path is a link that leads out of a folder."""
     try:
         return not path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError):  # loops of links and names that are too long lead nowhere
@@ -288,10 +287,10 @@ def leads_out(folder: Path, path: Path) -> bool:
 
 @contextlib.contextmanager
 def reading_png(path: Path, reason: str) -> Iterator[None]:
-    """Raise whatever an image library makes of a damaged PNG as `CorruptFile`.
+    """Turn errors of an image library about a damaged PNG into `CorruptFile`.
 
     Raises:
-        CorruptFile: with the reason, for all that reading raises, other than a `CorruptFile` itself.
+        CorruptFile: with the reason, for every error.
     """
     try:
         yield

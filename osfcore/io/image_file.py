@@ -13,7 +13,12 @@ from osfcore.io.files import write_atomically
 
 
 def to_uint8(image: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Return values in [0, 1] as 8 bit, 0 to 255; what lies outside is cut."""
+    """Return values in [0, 1] as 8-bit values, 0 to 255. Values outside [0, 1] are clipped.
+
+    Example:
+        >>> to_uint8(np.array([-0.1, 0.2, 1.0]))
+        array([  0,  51, 255], dtype=uint8)
+    """
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
@@ -36,10 +41,18 @@ def png_header(path: Path) -> tuple[int, int, int, int] | None:
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w *channels"]) -> None:
-    """Write an RGB or grey image; the file appears only when it is whole.
+    """Write an image as a PNG file. The file appears only once it is complete.
+
+    Args:
+        path: the file to write.
+        image: RGB, shape (h, w, 3), or grey, shape (h, w).
 
     Raises:
-        CannotWrite: if the disk refuses.
+        CannotWrite: if the file cannot be written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> write_png(Path("view.png"), to_uint8(rendered.rgb[0, 0]))
     """
     write_atomically(path, encode_png(image))
 

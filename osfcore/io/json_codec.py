@@ -1,4 +1,4 @@
-"""The one JSON codec: entries as pydantic models, and one sentence for what does not fit them.
+"""The JSON codec of all files: entries are pydantic models, and an error is one sentence.
 
 The models of `scene_file` and `state_file` are what files hold and what the REST interface sends. Reports and scores
 are plain dataclasses, which the same codec takes.
@@ -37,7 +37,7 @@ _ALLOWED = {  # what is allowed, by pydantic's types of errors
 
 
 def _as_a_whole(allowed: str) -> WrapValidator:
-    """Refuse an array as a whole instead of its first wrong number."""
+    """Report an error of an array as a whole instead of its first wrong number."""
 
     def validate(value: object, inner: ValidatorFunctionWrapHandler) -> Any:  # noqa: ANN401
         try:
@@ -81,14 +81,14 @@ def decode(kind: type[T], data: object, what: str, *, is_stored: bool = False) -
     """Return an entry or a dataclass of parsed JSON.
 
     Args:
-        kind: its class.
-        data: what `json.loads` returned.
-        what: name of the whole for the message, such as "scene".
-        is_stored: whether it is what a program has written, perhaps another version: lists stand for tuples, and
-            members that are unknown are left out, although the class refuses them.
+        kind: class of the result.
+        data: the result of `json.loads`.
+        what: name of the whole for messages, such as "scene".
+        is_stored: whether a program wrote the data, perhaps another version of it. Lists are then read as tuples, and
+            unknown members are ignored, even if the class refuses them.
 
     Raises:
-        InvalidInput: for the first thing that does not fit; the message says where it stands.
+        InvalidInput: for the first member that does not fit; the message names it.
     """
     try:
         if is_stored:

@@ -1,12 +1,12 @@
-"""Read and write observation folders: what cameras and robot report at one instant.
+"""Reading and writing of observation folders: images and pusher position at one instant.
 
 Layout: DIR/observation.json beside 8-bit PNGs.
 
     {"cameras": [as in scene.json], "images": {camera: file}, "objects": [names],
      "masks": {camera: {object: file}}, "pusher": {"position": [3]} or null, "time_s": 0}
 
-Images are RGB, linear radiance as value / 255. Masks have a single channel, in which more than 127 is the object.
-`masks`, `pusher` and `time_s` may be missing; where there are masks, an object without one is not visible in that view.
+Images are RGB; linear radiance is value / 255. Masks have a single channel, in which values above 127 show the object.
+`masks`, `pusher` and `time_s` may be missing. If there are masks, an object without one is not visible in that view.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MASK_LEVEL = 127
 
 
 class ObservationJson(Entry):
-    """What observation.json holds."""
+    """Contents of observation.json."""
 
     cameras: list[CameraJson]
     images: dict[str, Any]  # `_inside` checks the names of files
@@ -47,7 +47,7 @@ class ObservationJson(Entry):
 
 
 def is_observation(path: Path) -> bool:
-    """Whether a path is a folder with an observation in it."""
+    """Return whether a path is a folder with an observation."""
     return (path / OBSERVATION_FILE).exists()
 
 
@@ -65,10 +65,10 @@ def read_observation(folder: Path) -> Observation:
 
 
 def write_observation(folder: Path, observation: Observation) -> None:
-    """Write an observation; the folder counts as one only when everything is there.
+    """Write an observation. The folder counts as an observation only once everything is there.
 
-    Images are not synced here, but by whoever puts the folder in place (see `osfcore.io.files`): one by one that would
-    take longer than rendering them, and many a folder only brings them from one process to another.
+    Images are not synced here but by the caller that puts the folder in place (see `osfcore.io.files`). Syncing them
+    one by one would take longer than rendering them, and many folders only carry images from one process to another.
 
     Raises:
         InvalidInput: if arrays, cameras and names do not fit each other.

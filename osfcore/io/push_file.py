@@ -1,4 +1,4 @@
-"""Episodes of pushes on disk: one file per finished episode while collecting, one HDF5 file in the end."""
+"""Episodes of pushes on disk: one file per finished episode during collection, one HDF5 file at the end."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class Disturbed:
     """W substeps from disturbed states of an episode of N objects, for learning from.
 
     Attributes:
-        step: number of the substep in the episode, M of them to an action.
-        positions: of the objects, before [m].
-        quaternions: likewise, (w, x, y, z).
-        linear: velocity of each object's origin, before [m per substep].
-        angular: likewise [rad per substep].
-        after_positions: a substep later [m].
-        after_quaternions: likewise.
+        step: index of the substep in the episode; an action has M substeps.
+        positions: positions of the objects before the substep [m].
+        quaternions: orientations of the objects before the substep, (w, x, y, z).
+        linear: velocity of each object's origin before the substep [m per substep].
+        angular: angular velocity of each object before the substep [rad per substep].
+        after_positions: positions after the substep [m].
+        after_quaternions: orientations after the substep.
     """
 
     step: Int[np.ndarray, "W"]
@@ -49,17 +49,18 @@ class PushEpisode:
     """One episode: T actions of 0.2 s, N objects.
 
     Attributes:
-        names: the objects.
-        seed: that made the scene and the actions.
-        positions: of the objects, before the first and after each action [m].
-        quaternions: likewise, (w, x, y, z).
-        pusher: centre of the pusher, likewise [m].
+        names: names of the objects.
+        seed: seed of the scene and the actions.
+        positions: positions of the objects, before the first and after each action [m].
+        quaternions: orientations of the objects at the same instants, (w, x, y, z).
+        pusher: centre of the pusher at the same instants [m].
         actions: commanded velocities (vx, vy, 0) [m/s].
         contact: whether the pusher touched the object during the action.
-        sub_positions: of the objects at M equally spaced instants of each action, the last its end [m]; or None.
-        sub_quaternions: likewise.
-        frames: images of one camera, likewise, or None.
-        disturbed: what single substeps would have done from states near the recorded ones, or None.
+        sub_positions: positions of the objects at M equally spaced instants of each action, the last its end [m]; or
+            None.
+        sub_quaternions: orientations of the objects at these instants, or None.
+        frames: images of one camera before the first and after each action, or None.
+        disturbed: outcomes of single substeps from states near the recorded ones, or None.
     """
 
     names: tuple[str, ...]
@@ -82,14 +83,14 @@ _PREFIX = "disturbed_"  # of their names on disk
 
 
 class EpisodeFolder:
-    """The folder of finished episodes beside the final file, so that a killed collection goes on where it was.
+    """The folder of finished episodes beside the final file, with which a killed collection can continue.
 
     Args:
         out: the final HDF5 file.
-        settings: what the episodes depend on; a folder begun with other settings is refused.
+        settings: settings that the episodes depend on. A folder with other settings is refused.
 
     Raises:
-        InvalidInput: if the folder was begun with other settings, or another process is collecting into it.
+        InvalidInput: if the folder has other settings, or another process is collecting into it.
     """
 
     def __init__(self, out: Path, settings: Mapping[str, object]) -> None:
@@ -113,7 +114,7 @@ class EpisodeFolder:
         self._lock.close()
 
     def _adopt(self, settings: Mapping[str, object]) -> None:
-        """Clean up after a killed run and make sure that it had the same settings."""
+        """Clean up after a killed run, and check that it had the same settings."""
         for leftover in (*self._folder.glob(".*"), *self._out.parent.glob(f".{glob.escape(self._out.name)}.*")):
             leftover.unlink()
         text = json.dumps(dict(settings), sort_keys=True)
@@ -130,7 +131,7 @@ class EpisodeFolder:
         return self._folder / f"{index:07d}.npz"
 
     def finished(self) -> frozenset[int]:
-        """Return the indices of the episodes that are there and whole; a damaged one is collected again."""
+        """Return the indices of complete episodes. Damaged ones are collected again."""
         whole = set()
         for path in self._folder.glob("*.npz"):
             with contextlib.suppress(OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):  # cut short
@@ -152,7 +153,7 @@ class EpisodeFolder:
 
 
 def save_episode(path: Path, episode: PushEpisode) -> None:
-    """Write one episode; the file appears complete or not at all.
+    """Write one episode atomically.
 
     Raises:
         CannotWrite: if the disk refuses.
@@ -195,7 +196,7 @@ def read_sound_pushes(path: Path) -> tuple[PushEpisode, ...]:
     """Return all episodes of a push file after checking every array.
 
     Raises:
-        CorruptFile: if there are no episodes, or an array has another shape or holds what is not a finite number.
+        CorruptFile: if there are no episodes, or an array has another shape or values that are not finite.
     """
     episodes = read_pushes(path)
     if not episodes:

@@ -38,7 +38,7 @@ class Scene:
 
 
 class PointJson(Entry):
-    """A place in the world."""
+    """A position in the world."""
 
     position: Vector3 = Field(description="[m], world frame.")
 
@@ -49,7 +49,7 @@ class PointJson(Entry):
 
 
 class ObjectJson(Entry):
-    """Where an object is."""
+    """An object and its pose."""
 
     name: Text
     position: Vector3 = Field(description="[m], world frame.")
@@ -106,7 +106,7 @@ def rigid_pose(matrix: list[list[float]], camera: str) -> Pose:
 
 
 class StateJson(Entry):
-    """Where everything is."""
+    """A scene state."""
 
     objects: list[ObjectJson]
     light: PointJson
@@ -136,7 +136,7 @@ class SceneJson(StateJson):
 
 
 def pusher_of(state: SceneState) -> dict[str, PointJson]:
-    """Return the pusher of a state, if there is one, by its key."""
+    """Return the pusher of a state under its key, if there is one."""
     return {} if state.pusher is None else {"pusher": PointJson.of(state.pusher)}
 
 
@@ -177,7 +177,15 @@ def cameras_of(entries: Iterable[CameraJson]) -> tuple[Camera, ...]:
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """Return one camera as scene.json holds it: "name", "T_world_camera" 4 x 4, "K" 3 x 3 [px], "width", "height"."""
+    """Return a camera in the JSON form of scene.json.
+
+    Returns:
+        "name", "T_world_camera" (4 x 4), "K" (3 x 3) [px], "width" and "height" [px].
+
+    Example:
+        >>> camera_to_json(goal_camera(64))["width"]
+        64
+    """
     return encode(CameraJson.of(camera))
 
 
@@ -199,7 +207,7 @@ def read_scene(path: Path) -> Scene:
     return read_json(path, scene_from_json)
 
 
-# actions.json and rollouts.json: what to try, and what would come of it.
+# actions.json and rollouts.json: sequences of actions, and their predicted futures.
 #
 # actions.json {"actions": K x T x 3 [m/s], "step_s": 0.2} rollouts.json {"names": [N], "positions": K x (T+1) x N x
 # 3 [m], "quaternions": K x (T+1) x N x 4, "pusher": K x (T+1) x 3 [m], "step_s": 0.2}
@@ -267,48 +275,48 @@ def write_rollouts(path: Path, rollouts: Rollouts) -> None:
     write_json(path, rollouts_to_json(rollouts))
 
 
-# state.json: what an estimator believes as a file, checked when read.
+# state.json: the file of an estimate, checked when read.
 #
 #     {"objects": [{"name", "position": [3], "quaternion": [w, x, y, z], "doubt": "",
 #                   "uncertainty": {"position_std_m", "rotation_std_rad"}}],
 #      "light": {"position": [3], "uncertainty": {"direction_std_rad"}}, "pusher": {"position": [3]},
 #      "trusted": true, "reason": ""}
 #
-# It is a scene.json without cameras, with more to it: whatever reads scenes reads it too. A plain scene.json is a
-# state without uncertainty that is trusted. An uncertainty of null is one without bounds, for JSON has no infinity.
+# It is a scene.json without cameras and with additional members, so that programs that read scenes can read it. A plain
+# scene.json is a trusted state without uncertainty. An uncertainty of null is unbounded, since JSON has no infinity.
 
 
 _Deviation = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class PoseUncertaintyJson(Entry):
-    """Standard deviations; null for one without bounds."""
+    """Standard deviations; null if unbounded."""
 
     position_std_m: _Deviation | None = Field(default=0.0, description="Per axis [m].")
     rotation_std_rad: _Deviation | None = Field(default=0.0, description="Per axis of a small rotation [rad].")
 
 
 class EstimatedObjectJson(ObjectJson):
-    """Where an object is believed to be."""
+    """The estimated pose of an object."""
 
     uncertainty: PoseUncertaintyJson = PoseUncertaintyJson()
     doubt: Text = Field(default="", description="Why not to trust it; empty where it may be.")
 
 
 class LightUncertaintyJson(Entry):
-    """Standard deviation; null for one without bounds."""
+    """Standard deviation; null if unbounded."""
 
     direction_std_rad: _Deviation | None = Field(default=0.0, description="Per axis [rad].")
 
 
 class EstimatedLightJson(PointJson):
-    """Where the light is believed to be, 1 m from the table's centre."""
+    """The estimated light, as a position 1 m from the table's centre."""
 
     uncertainty: LightUncertaintyJson = LightUncertaintyJson()
 
 
 class EstimateJson(StateJson):
-    """A state and how far it can be trusted."""
+    """A state, its uncertainty, and whether it can be trusted."""
 
     objects: list[EstimatedObjectJson]  # pyright: ignore[reportIncompatibleVariableOverride]
     light: EstimatedLightJson  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -379,12 +387,12 @@ def estimated_from_json(data: object) -> EstimatedState:
 
 
 def is_estimated(data: object) -> bool:
-    """Whether parsed JSON says how far a state may be trusted, as a scene.json does not."""
+    """Return whether parsed JSON has the members of an estimate, which a scene.json has not."""
     return isinstance(data, dict) and ("trusted" in data or "reason" in data)
 
 
 def read_estimated(path: Path) -> EstimatedState:
-    """Return the state in a file; also of a scene.json.
+    """Return the estimate in a state.json, or the state in a scene.json.
 
     Raises:
         CorruptFile: if it cannot be read or is neither; the message says why.

@@ -24,7 +24,7 @@ def rotation_error(symmetry: Symmetry, estimated: Float[np.ndarray, "4"], true: 
     """Return the least angle [rad] to any orientation that looks like the true one.
 
     Args:
-        symmetry: of the object; for a body of revolution only the tilt of its axis counts.
+        symmetry: symmetry of the object; for a body of revolution only the tilt of its axis counts.
         estimated: rotation from the object's frame to the world, unit.
         true: the same.
     """
@@ -43,7 +43,7 @@ def rotation_components(
     """Return the rotation from the nearest orientation that looks like the true one to the estimated one [rad].
 
     Args:
-        symmetry: of the object.
+        symmetry: symmetry of the object.
         estimated: rotation from the object's frame to the world, unit.
         true: the same.
 

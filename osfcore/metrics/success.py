@@ -22,7 +22,7 @@ class RearrangementTask:
     """A scene and its goal.
 
     Attributes:
-        number: of the task.
+        number: number of the task.
         start: the truth at the beginning, at rest, with the pusher in a free place.
         goal: the true goal, without pusher, under the light of the goal image.
         moved: the objects whose goals lie elsewhere.
@@ -39,7 +39,7 @@ class ObjectScore:
     """The final errors of one object.
 
     Attributes:
-        name: of the object.
+        name: name of the object.
         had_to_move: whether its goal lay elsewhere.
         mm: distance from its goal [mm].
         deg: angle likewise, symmetries considered [deg].
@@ -123,7 +123,7 @@ def score_of(task: RearrangementTask, end: SceneState, symmetries: Mapping[str, 
     Args:
         task: start, goal, and which objects had to move, at least one.
         end: the true state at the end.
-        symmetries: of every object of the task, by name.
+        symmetries: symmetries of every object of the task, by name.
     """
     objects = []
     for name in task.start.names:

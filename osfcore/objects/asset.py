@@ -23,9 +23,10 @@ class Symmetry:
 
     Attributes:
         kind: "none", "discrete" or "continuous".
-        rotations: for "discrete", the unit quaternions (w, x, y, z) that map the object to itself, identity left out.
+        rotations: for "discrete", the unit quaternions (w, x, y, z) that map the object to itself, without the
+            identity.
         axis: for "continuous", the axis of revolution in the object frame.
-        reason: why, in a few words.
+        reason: reason for this choice, in a few words.
     """
 
     kind: Literal["none", "discrete", "continuous"]
@@ -42,8 +43,8 @@ class ObjectInfo:
         name: identifier such as "006_mustard_bottle".
         label: name for a person, such as "Mustard bottle".
         mass_kg: mass [kg].
-        symmetry: of its appearance.
-        licence: of the mesh, in SPDX form where there is one.
+        symmetry: symmetry of its appearance.
+        licence: licence of the mesh, in SPDX form if there is one.
         attribution: whom to credit.
     """
 
@@ -60,8 +61,8 @@ class TexturedMesh:
     """Triangles with smooth normals and one texture; corners on a UV seam are separate vertices with equal normals.
 
     Attributes:
-        vertices: in the object frame [m].
-        normals: unit, outward.
+        vertices: vertices in the object frame [m].
+        normals: outward unit normals.
         faces: vertex indices, counter-clockwise from outside.
         uv: texture coordinates in [0, 1], v upwards as in OBJ.
         texture: linear RGB, first row at v = 1; texels that no face covers continue their neighbours' colours.
@@ -79,7 +80,7 @@ class ObjectGeometry:
     """The shape of an object, in its frame.
 
     Attributes:
-        vertices: of its mesh [m].
+        vertices: vertices of its mesh [m].
         faces: vertex indices, counter-clockwise from outside.
         parts: vertices of each convex collision part [m].
     """
@@ -94,8 +95,8 @@ class RestingPoses:
     """Orientations in which the object rests on a plane.
 
     Attributes:
-        quaternions: rotation from object frame to a z-up world, (w, x, y, z); any turn about z rests as well.
-        probabilities: of landing so when dropped at random; they sum to 1, largest first.
+        quaternions: rotations from the object frame to a z-up world, (w, x, y, z), each up to a turn about z.
+        probabilities: probability of each orientation after a random drop, largest first. They sum to 1.
     """
 
     quaternions: Float[np.ndarray, "M 4"]
@@ -104,13 +105,13 @@ class RestingPoses:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ObjectAsset:
-    """Everything the simulator needs of one object.
+    """Everything that the simulator needs of one object.
 
     Attributes:
         info: catalogue facts.
-        mesh: for pictures.
+        mesh: mesh for images.
         parts: vertices of each convex collision part, in the object frame [m].
-        resting: orientations for scenes.
+        resting: resting orientations, for scenes.
     """
 
     info: ObjectInfo
@@ -142,7 +143,7 @@ def viewer_glb(mesh: TexturedMesh) -> bytes:
 
 
 def light_mesh(mesh: TexturedMesh, max_side: int) -> trimesh.Trimesh:
-    """Return the mesh as exporters take it: matte, with a JPEG texture of at most `max_side` texels a side."""
+    """Return the mesh for exporters: matte, with a JPEG texture of at most `max_side` texels a side."""
     import trimesh
     from PIL import Image
     from trimesh.visual.material import PBRMaterial

@@ -1,8 +1,8 @@
-"""Objects on disk: one folder each, written whole or not at all.
+"""A library of objects on disk, with one folder for each object.
 
 A folder holds `object.json` (facts, format version, checksums), `arrays.npz` (mesh, collision parts, resting
-orientations), `texture.png`, and `viewer.glb`, a light copy for 3D views in browsers. A kill or a full disk while one
-is written leaves either the old object or none.
+orientations), `texture.png`, and `viewer.glb`, a light copy for 3D views in browsers. Folders are written atomically: a
+kill or a full disk leaves either the old object or none.
 """
 
 from __future__ import annotations
@@ -41,12 +41,16 @@ _TEMPORARY_LIFE_S = 600  # far longer than one write takes; older ones were left
 
 @dataclass(frozen=True)
 class AssetLibrary:
-    """The objects in one folder.
+    """A library of objects in one folder: meshes, textures, collision shapes, and resting orientations.
 
-    Several processes may read and write at once: readers see whole objects only.
+    `osf assets fetch` fills it. Several processes may read and write at once; readers see complete objects only.
 
     Attributes:
-        root: the folder, usually DATA_DIR/objects; made at the first write.
+        root: the folder, usually DATA_DIR/objects. The first write creates it.
+
+    Example:
+        >>> assets.size_m("006_mustard_bottle").round(2)  # along x, y and z of the object frame [m]
+        array([0.1 , 0.07, 0.19])
     """
 
     root: Path
@@ -59,7 +63,7 @@ class AssetLibrary:
         return tuple(name for name in self._folders() if self.has(name))
 
     def damaged(self) -> dict[str, str]:
-        """Return why objects on this machine cannot be loaded, by name."""
+        """Return the damaged objects: for each name, why the object cannot be loaded."""
         found = {}
         for name in self._folders():
             try:
@@ -71,7 +75,7 @@ class AssetLibrary:
         return found
 
     def has(self, name: str) -> bool:
-        """Whether there is an object of this name, written by a version that this one can read, and not damaged."""
+        """Return whether an object of this name can be loaded."""
         try:
             self.check(name)
         except OsfError:
@@ -79,7 +83,7 @@ class AssetLibrary:
         return True
 
     def check(self, name: str) -> None:
-        """Check that an object can be loaded, by the checksums of its files, each of which is read once.
+        """Check by the checksums of its files that an object can be loaded. Each file is read only once.
 
         Raises:
             MissingAssets: if the object is in the catalogue but not on this machine.
@@ -95,10 +99,10 @@ class AssetLibrary:
                     raise CorruptFile(path, _WRONG_CHECKSUM)
 
     def info(self, name: str) -> ObjectInfo:
-        """Return the facts of an object of the catalogue, fetched or not, or of one that a user added.
+        """Return facts about an object of the catalogue, fetched or not, or about one that a user added.
 
         Raises:
-            UnknownName: if it is neither.
+            UnknownName: if there is no such object.
             CorruptFile: if a user's object is damaged.
         """
         if name in CATALOGUE:
@@ -107,22 +111,22 @@ class AssetLibrary:
             return decode(ObjectInfo, facts["info"], "info")
 
     def label(self, name: str) -> str:
-        """Return the label of an object; its name where nothing else is known."""
+        """Return the label of an object for people, or its name if it has no label."""
         try:
             return self.info(name).label
         except OsfError:  # removed meanwhile, or damaged
             return name
 
     def in_words(self, sentence: str) -> str:
-        """Return a sentence with the objects' labels in place of their names."""
+        """Return a sentence in which labels replace the names of objects."""
         return _NAME.sub(lambda word: self.label(word[0]), sentence)
 
     def source(self, name: str) -> str:
-        """Return where an object on this machine came from, as given to `write`."""
+        """Return the source of an object on this machine, as it was given to `write`."""
         return str(self._known_facts(name).get("source", ""))
 
     def size_m(self, name: str) -> Float[np.ndarray, "3"]:
-        """Return the extents of the bounding box in the object frame [m], without loading the mesh.
+        """Return the sides of an object's bounding box in the object frame [m], without loading the mesh.
 
         Raises:
             MissingAssets: if the object is in the catalogue but not on this machine.
@@ -151,7 +155,7 @@ class AssetLibrary:
             return ObjectAsset(self.info(name), mesh, _parts(arrays), resting)
 
     def load_geometry(self, name: str) -> ObjectGeometry:
-        """Return an object's shape alone, without decoding its texture, which takes most of the time of `load`.
+        """Return the mesh and collision parts of an object without its texture. This is much faster than `load`.
 
         Raises:
             MissingAssets: if the object is in the catalogue but not on this machine.
@@ -163,7 +167,7 @@ class AssetLibrary:
             return ObjectGeometry(arrays["vertices"], arrays["faces"], _parts(arrays))
 
     def digest(self, name: str) -> str:
-        """Return a hash that differs from any other object and any earlier one of its name, without loading it.
+        """Return a hash of an object's contents, without loading it.
 
         Raises:
             MissingAssets: if the object is in the catalogue but not on this machine.
@@ -186,14 +190,14 @@ class AssetLibrary:
             return self._checked(name, _VIEWER, facts)
 
     def write(self, asset: ObjectAsset, source: str) -> None:
-        """Put an object in place of an older one of the same name, if there is one.
+        """Write an object. It replaces an older one of the same name.
 
         Args:
-            asset: what to write.
+            asset: the object.
             source: where it came from, for people.
 
         Raises:
-            FetchFailed: if the disk is full or the folder cannot be written; nothing is changed.
+            FetchFailed: if the disk is full or the folder cannot be written. Nothing is then changed.
         """
         mesh = asset.mesh
         files = {_ARRAYS: _array_bytes(asset), _TEXTURE: encode_png(mesh.texture), _VIEWER: viewer_glb(mesh)}
@@ -214,17 +218,17 @@ class AssetLibrary:
             replace_folder(folder, self.root / asset.info.name)
 
     def remove(self, name: str) -> None:
-        """Delete an object that a user added, damaged or not.
+        """Delete an object that a user added, even if it is damaged.
 
         Raises:
             UnknownName: if there is no such object.
-            InvalidInput: if it is the catalogue's.
-            CannotWrite: if that is not allowed.
+            InvalidInput: if the object belongs to the catalogue.
+            CannotWrite: if the folder cannot be changed.
         """
         if name not in self._folders():
             raise UnknownName("object", name, {*CATALOGUE, *self.names()})
         if name in CATALOGUE:
-            raise InvalidInput("object to delete", name, "one that was added here; the catalogue's stay")
+            raise InvalidInput("object to delete", name, "one that you added; those of the catalogue stay")
         with writing(self.root):
             with self._scratch() as trash:
                 (self.root / name).rename(trash / "old")
@@ -266,7 +270,7 @@ class AssetLibrary:
 
     @contextlib.contextmanager
     def _reading(self, name: str) -> Iterator[dict[str, Any]]:
-        """Give the facts of an object, and raise what damaged contents lead to as `CorruptFile`."""
+        """Yield the facts of an object; turn errors from damaged contents into `CorruptFile`."""
         facts = self._known_facts(name)
         try:
             yield facts
@@ -282,7 +286,7 @@ class AssetLibrary:
 
 @functools.lru_cache(maxsize=1024)
 def _crc32(path: Path, inode: int, size: int, mtime_ns: int) -> int:
-    """Return the checksum of a file, which has not changed as long as the other arguments are the same."""
+    """Return the checksum of a file. The other arguments tell versions of the file apart."""
     del inode, size, mtime_ns
     return zlib.crc32(path.read_bytes())
 
@@ -292,12 +296,12 @@ def _parts(arrays: dict[str, np.ndarray]) -> tuple[Float[np.ndarray, "_ 3"], ...
 
 
 def _is_plain(name: str) -> bool:
-    """Whether a name can be that of a folder in the library, and of nothing elsewhere."""
+    """Return whether a name is a plain folder name, which cannot lead out of the library."""
     return re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", name) is not None
 
 
 def check_name(name: str) -> str:
-    """Return a name after checking that a user's object may have it.
+    """Check that a user's object may have this name, and return the name.
 
     Raises:
         InvalidInput: if it is not 1 to 64 lower-case letters, digits, "_" and "-", the first a letter or digit.

@@ -1,4 +1,4 @@
-"""Download and unpack files: bounded in size and time, never half there."""
+"""Downloading and unpacking of files, with limits on size and time. Files appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _TEMPORARY_LIFE_S = 3600  # older folders were left by a killed process
 
 @contextlib.contextmanager
 def raising_fetch_failed(what: str, place: Path) -> Iterator[None]:
-    """Raise an `OSError`, such as of a full disk, as `FetchFailed`."""
+    """Turn an `OSError`, such as a full disk, into `FetchFailed`."""
     try:
         yield
     except OSError as error:
@@ -39,10 +39,10 @@ def raising_fetch_failed(what: str, place: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def temporary_folder(parent: Path, what: str) -> Iterator[Path]:
-    """Give a folder inside `parent` that is gone afterwards; folders that a killed process left long ago go with it.
+    """Yield a folder inside `parent` that is deleted afterwards, together with old folders of killed processes.
 
     Raises:
-        FetchFailed: if it cannot be made.
+        FetchFailed: if it cannot be created.
     """
     with contextlib.ExitStack() as stack:
         with raising_fetch_failed(what, parent):
@@ -51,16 +51,16 @@ def temporary_folder(parent: Path, what: str) -> Iterator[Path]:
 
 
 def download(address: str, path: Path, max_bytes: int = MAX_BYTES) -> bool:
-    """Load a file from an http(s) address, with a few tries; False if the server does not have it.
+    """Download a file from an http(s) address, with a few tries; return False if the server does not have it.
 
     Args:
         address: URL.
-        path: where the file goes, over an older one.
+        path: file to write. An older one is replaced.
         max_bytes: largest size that is accepted [bytes].
 
     Raises:
         FetchFailed: if the server cannot be reached, answers with an error, sends too much or breaks off, or the disk
-            is full; `path` is then not there.
+            is full. `path` then does not exist.
     """
     reason = ""
     for attempt in range(TRIES):
@@ -106,11 +106,11 @@ def _save(answer: http.client.HTTPResponse, path: Path, max_bytes: int, address:
 
 
 def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
-    """Unpack a tar archive; nothing in it can land outside the folder.
+    """Unpack a tar archive. None of its files can be written outside the folder.
 
     Args:
-        archive: .tar, also compressed.
-        folder: where its files go.
+        archive: a .tar file, which may be compressed.
+        folder: folder to write to.
         max_bytes: largest sum of its files' sizes that is accepted [bytes].
 
     Raises:
@@ -143,10 +143,10 @@ def unpack(archive: Path, folder: Path, max_bytes: int = MAX_BYTES) -> None:
 
 
 def pip_download(requirement: str, folder: Path) -> Iterator[int]:
-    """Download one wheel into `folder` with pip, without dependencies; yields the bytes that have arrived so far.
+    """Download one wheel into `folder` with pip, without dependencies; yield the bytes that have arrived so far.
 
     Raises:
-        FetchFailed: if pip is missing or fails; the reason is its own last words.
+        FetchFailed: if pip is missing or fails; the reason is pip's last message.
     """
     scratch = folder / "pip"
     scratch.mkdir()

@@ -33,31 +33,31 @@ class Source(ABC):
     """A place that meshes can be fetched from.
 
     Attributes:
-        label: its name in messages and in the objects' records.
+        label: name of the source in messages and in the objects' records.
     """
 
     label: str
 
     def names(self) -> tuple[str, ...]:
-        """Return the objects that are fetched when none are named; the default ten where a source cannot list any."""
+        """Return the objects to fetch if none are named; the default ten if the source cannot list its objects."""
         return DEFAULT_NAMES
 
     def prepare(self) -> Iterator[Progress]:
-        """Do what is needed once for all objects; steps count from 0 to their own total.
+        """Do the work that is needed once for all objects; yield steps that count from 0 to their own total.
 
         Raises:
-            FetchFailed: if that is not possible.
+            FetchFailed: if it fails.
         """
         yield Progress(1, 1, f"Reading {self.label}")
 
     @abstractmethod
     def mesh(self, name: str, folder: Path) -> Path:
-        """Return the mesh of one object, put into `folder` if it does not lie on this machine already.
+        """Return the mesh file of one object. It is written to `folder` unless it is on this machine already.
 
-        It is of any format that `read_mesh` reads, or a .msh with its texture beside it as .png.
+        It has a format that `read_mesh` reads, or is a .msh with its texture beside it as .png.
 
         Raises:
-            UnknownName: if this source does not have it.
+            UnknownName: if this source does not have the object.
             FetchFailed: if it cannot be downloaded.
             CorruptFile: if an archive is damaged.
         """
@@ -67,7 +67,7 @@ class WheelSource(Source):
     """Ten YCB objects from the wheel of MyoSuite on PyPI, downloaded with pip, never installed or imported.
 
     Args:
-        cache: folder in which the wheel is kept, so that a second fetch needs no network.
+        cache: folder that keeps the wheel, so that a second fetch needs no network.
     """
 
     REQUIREMENT = "MyoSuite==2.8.0"
@@ -85,7 +85,7 @@ class WheelSource(Source):
         """Download and verify the wheel unless the cache has it.
 
         Raises:
-            FetchFailed: without network, pip or disk space, or if the checksum is wrong.
+            FetchFailed: if there is no network, pip or disk space, or the checksum is wrong.
         """
         note = f"Checking {self.label}"
         yield Progress(0, 1, note)
@@ -154,7 +154,7 @@ class FolderSource(Source):
         return available
 
     def mesh(self, name: str, folder: Path) -> Path:
-        """Return the mesh where it lies."""
+        """Return the mesh file in its folder."""
         del folder  # nothing has to be copied
         path = _mesh_in(self._folder, name)
         if path is None:
@@ -173,7 +173,7 @@ class UrlSource(Source):
 
     Args:
         base: http or https address of the folder.
-        cache: archives are kept in a folder of this one.
+        cache: folder in which archives are kept.
 
     Raises:
         InvalidInput: if it is not an http(s) address.
@@ -270,21 +270,22 @@ def fetch(
 ) -> Iterator[Progress]:
     """Bring objects of the catalogue from a source into the library.
 
-    Each object is written whole or not at all; those finished before a failure stay.
+    Each object is written atomically. Objects that were finished before a failure stay.
 
     Args:
-        names: of the catalogue; empty for all that the source offers.
-        source: where the meshes are.
-        library: where the objects go; those that it has already are left alone.
-        executor: does the conversion, mostly convex decomposition, of several objects at once; None for one by one.
-        force: fetch also what the library has.
+        names: names of the catalogue; empty for all that the source offers.
+        source: source of the meshes.
+        library: library to write to. Objects that it has already are skipped.
+        executor: pool that converts several objects at once, which is mostly convex decomposition; None to convert one
+            after the other.
+        force: whether to fetch objects again that the library has.
 
     Yields:
         Steps whose `total` counts the objects and one step of preparation.
 
     Raises:
         UnknownName: if a name is not in the catalogue or the source does not have it.
-        FetchFailed: without network or disk space.
+        FetchFailed: if there is no network or disk space.
         CorruptFile: if a file of the source is damaged.
     """
     check_known("object in the catalogue", names, CATALOGUE)
@@ -335,14 +336,14 @@ def convert(path: Path, info: ObjectInfo, library: AssetLibrary, source: str) ->
     """Read one object's mesh, make its collision parts and resting orientations, and write it.
 
     Args:
-        path: of the mesh, as `Source.mesh` returns it.
+        path: path of the mesh, as `Source.mesh` returns it.
         info: the catalogue's facts about the object.
-        library: where it goes, over an older one of that name.
+        library: library to write to. An older object of that name is replaced.
         source: where the mesh came from, for people.
 
     Raises:
         CorruptFile: if a file is damaged.
-        InvalidInput: if the mesh is not of a tabletop object's size, or encloses no volume.
+        InvalidInput: if the mesh is not as large as a tabletop object, or encloses no volume.
         FetchFailed: if the disk is full.
     """
     from osfcore.objects.mesh import PLAIN_SIDE, read_mesh, read_msh
@@ -367,9 +368,10 @@ def make_asset(mesh: TexturedMesh, info: ObjectInfo) -> ObjectAsset:
 
 
 def guessed_mass(mesh: TexturedMesh) -> float:
-    """Guess the mass of a thing of unknown material from its convex hull, to two digits [kg].
+    """Guess the mass of an object of unknown material from its convex hull, to two digits [kg].
 
-    Seventeen of twenty YCB objects are within a factor of 2.8. It is 1 g to 20 kg; without a volume, the least.
+    The guess is within a factor of 2.8 for seventeen of twenty YCB objects. It lies between 1 g and 20 kg, and is 1 g
+    without a volume.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -382,14 +384,14 @@ def guessed_mass(mesh: TexturedMesh) -> float:
 
 @dataclass(frozen=True, slots=True)
 class NewObject:
-    """What a user states of an object to add.
+    """Facts about a user's object to add.
 
     Attributes:
-        name: its name in scenes; not one of the catalogue's.
-        mass_kg: in (0, 20] [kg]; None to guess it from the volume.
-        label: name for a person; from `name` if empty.
+        name: name in scenes, which must not be in the catalogue.
+        mass_kg: mass, in (0, 20] [kg]; None to guess it from the volume.
+        label: name for people; made from `name` if empty.
         scale: metres for one unit of the file.
-        licence: of the mesh.
+        licence: licence of the mesh.
     """
 
     name: str
@@ -399,17 +401,17 @@ class NewObject:
     licence: str = "unknown"
 
     def info(self, mesh: TexturedMesh) -> ObjectInfo:
-        """Return the facts that the library keeps of an object with this mesh."""
+        """Return the facts about an object with this mesh that the library stores."""
         mass_kg = guessed_mass(mesh) if self.mass_kg is None else float(self.mass_kg)
         text = self.label or self.name.replace("_", " ").replace("-", " ").capitalize()
         symmetry = Symmetry("none", reason="not examined")
         return ObjectInfo(self.name, text, mass_kg, symmetry, self.licence, "added by the user")
 
     def check(self) -> None:
-        """Refuse values that no object may have.
+        """Check the values.
 
         Raises:
-            InvalidInput: if the name is malformed or the catalogue's, or a value is out of range.
+            InvalidInput: if the name is malformed or in the catalogue, or a value is out of range.
         """
         check_name(self.name)
         if self.name in CATALOGUE:
@@ -424,17 +426,17 @@ class NewObject:
 
 
 def add_object(mesh_path: Path, new: NewObject, library: AssetLibrary, *, force: bool = False) -> ObjectAsset:
-    """Put a user's own textured mesh into the library.
+    """Add a user's textured mesh to the library.
 
     Args:
-        mesh_path: OBJ, GLB or another format of `read_mesh`.
-        new: its name, mass and other facts.
-        library: where it goes.
-        force: replace an object of that name.
+        mesh_path: file in OBJ, GLB or another format of `read_mesh`.
+        new: name, mass and other facts.
+        library: library to write to.
+        force: whether to replace an object of that name.
 
     Raises:
         InvalidInput: if the name is malformed or taken, or mass, scale or size are out of range.
-        CorruptFile: if the mesh is unusable.
+        CorruptFile: if the mesh cannot be used.
         FetchFailed: if the disk is full.
     """
     new.check()

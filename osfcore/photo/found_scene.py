@@ -1,4 +1,4 @@
-"""What was found in a photograph as JSON, in the table's frame where there is one, else in the camera's.
+"""The contents of a photograph as JSON, in the table's frame if the table is known, else in the camera's frame.
 
     {"table": "board" | "objects" | null,
      "objects": [{"name", "position": [3], "quaternion": [w, x, y, z], "loss", "iou", "doubt",
@@ -6,7 +6,7 @@
      "light": {"direction": [3], "std_deg", "diffuse", "distance_m", "distance_std_m"},
      "camera": {"name", "T_world_camera": 4x4, "K": 3x3, "width", "height"}, "other_cameras": [...], "notes": [...]}
 
-"board" and "objects" say how the table was found. "light" is null where too few pixels show objects.
+"table" names what the table was found from. "light" is null if too few pixels show objects.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ TableSource = Literal["board", "objects"]
 class FoundPose(Entry):
     """A pose, and how well it explains the photograph."""
 
-    position: Vector3 = Field(description="[m]")
+    position: Vector3 = Field(description="Position [m].")
     quaternion: Vector4 = Field(description="Unit quaternion (w, x, y, z).")
-    loss: float = Field(description="Of outline, shading and texture; less is better.")
-    iou: float = Field(description="Of the outline and the mask, 1 where they agree.")
+    loss: float = Field(description="Loss of outline, shading and texture; lower is better.")
+    iou: float = Field(description="Intersection over union of outline and mask; 1 if they agree.")
 
     def pose(self) -> Pose:
         """Return the pose."""
@@ -40,8 +40,8 @@ class FoundObject(FoundPose):
     """An object in its most likely pose."""
 
     name: Text
-    doubt: str = Field(description="Why it should not be trusted, a sentence; empty where it may be.")
-    rivals: list[FoundPose] = Field(description="Other orientations that explain the picture, the best first.")
+    doubt: str = Field(description="Why the pose should not be trusted, in one sentence; empty if it can be.")
+    rivals: list[FoundPose] = Field(description="Other orientations that explain the photo, the best first.")
 
     def poses(self) -> tuple[FoundPose, ...]:
         """Return the best pose, then its rivals."""
@@ -51,11 +51,11 @@ class FoundObject(FoundPose):
 class FoundLight(Entry):
     """The lamp."""
 
-    direction: Vector3 = Field(description="Unit vector toward it.")
-    std_deg: float = Field(description="Standard deviation of the direction.")
-    diffuse: bool = Field(description="Nothing speaks for one lamp; the direction then means little.")
-    distance_m: float | None = Field(description="From the frame's origin; null where it cannot be told.")
-    distance_std_m: float | None = Field(description="Its standard deviation.")
+    direction: Vector3 = Field(description="Unit vector toward the lamp.")
+    std_deg: float = Field(description="Standard deviation of the direction [deg].")
+    diffuse: bool = Field(description="True if the photo shows no single lamp; the direction is then unreliable.")
+    distance_m: float | None = Field(description="Distance from the frame's origin [m]; null if it is unknown.")
+    distance_std_m: float | None = Field(description="Standard deviation of the distance [m].")
 
 
 class FoundScene(Entry):
@@ -65,5 +65,5 @@ class FoundScene(Entry):
     objects: list[FoundObject]
     light: FoundLight | None
     camera: CameraJson
-    other_cameras: list[CameraJson] = Field([], description="Of further photos.")
+    other_cameras: list[CameraJson] = Field([], description="Cameras of further photos.")
     notes: list[str]

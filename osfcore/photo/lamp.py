@@ -1,4 +1,4 @@
-"""The lamp of photographs: its direction from shading and shadows, and its distance where the pictures show it."""
+"""The lamp of photographs: its direction from shading and shadows, and its distance if the photographs show it."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ def _check_count(pixels: np.ndarray) -> None:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ShadedPixels:
-    """Pixels whose surface is known.
+    """Pixels with known normal and albedo.
 
     Attributes:
-        radiance: linear, well exposed.
-        albedo: linear.
-        normals: unit, outward.
+        radiance: linear radiance, well exposed.
+        albedo: linear albedo.
+        normals: outward unit normals.
     """
 
     radiance: Vectors
@@ -89,10 +89,10 @@ class LampFit:
 
     Attributes:
         direction: unit vector toward the lamp, in the frame of the normals.
-        std: of it, per axis, from the curvature of the residuals [rad].
+        std: its standard deviation, per axis, from the curvature of the residuals [rad].
         strength: light of the lamp on a surface that faces it, per colour, where the radiance of white is 1.
         gain: share of the squared residual of ambient light and harmonics that the lamp explains.
-        is_diffuse: nothing speaks for a lamp; the direction then means little.
+        is_diffuse: whether there is no single lamp, so that the direction is unreliable.
     """
 
     direction: Vector
@@ -103,11 +103,12 @@ class LampFit:
 
 
 def fit_lamp(pixels: ShadedPixels, visible: Visibility = None) -> LampFit:
-    """Find the lamp.
+    """Estimate the direction of the lamp.
 
     Args:
-        pixels: of all objects in one photograph.
-        visible: share of a lamp's light from a direction that reaches each pixel past objects; all by default.
+        pixels: pixels of all objects in one photograph.
+        visible: function from a direction to the share of the lamp's light that reaches each pixel; no shadows by
+            default.
     """
     weights, grid = np.ones(len(pixels.radiance)), fibonacci_sphere(_DIRECTIONS)
     for shadows in [None] if visible is None else [None, visible]:
@@ -183,11 +184,11 @@ def _speaks_for_lamp(gain: float, gradient: Vector, ambient: float) -> bool:
     return bool(np.linalg.norm(gradient) > _MOST_DIRECTED * max(ambient, 0.0)) or gain > _LEAST_GAIN
 
 
-# Cast shadows of known objects: their surfels, drawn from the lamp, show what it lights (Williams 1978).
+# Cast shadows of known objects, by a shadow map of their surfels (Williams 1978).
 #
-# A point is lit as far as nothing nearer to the lamp was drawn where it would be seen; between the four pixels
-# around it the answer is interpolated, so that it changes gradually as the lamp moves. Distant lamps stand a
-# hundred times the objects' extent away.
+# A point is lit if nothing nearer to the lamp was drawn at its pixel. The result is interpolated between the four
+# pixels around it, so that it changes gradually as the lamp moves. Distant lamps are put at a hundred times the
+# objects' extent.
 
 
 _SIDE = 224  # of the picture that the lamp sees [px]
@@ -200,11 +201,11 @@ _WIDEST_RAD = 1.2  # half the lamp's field of view
 
 
 class Shadows:
-    """What objects hide from lamps.
+    """Shadows that objects cast.
 
     Args:
-        surfels: of each object.
-        poses: of each, in the world.
+        surfels: surfels of each object.
+        poses: poses of each, in the world.
     """
 
     def __init__(self, surfels: Sequence[Surfels], poses: Sequence[Pose]) -> None:
@@ -271,7 +272,7 @@ def _caster(surfels: Surfels, pose: Pose) -> tuple[Float32[np.ndarray, "S 3"], F
     return np.ascontiguousarray(moved, np.float32), np.ascontiguousarray(turned, np.float32), spacing
 
 
-# Pixels of photographs of which the place and the normal are known: of objects, and of the table around them.
+# Pixels whose position and normal are known: on objects, and on the table around them.
 
 
 TABLE = -1
@@ -289,13 +290,13 @@ class LitPixels:
     """Pixels of one scene.
 
     Attributes:
-        radiance: linear, well exposed.
-        albedo: linear; 1 on the table, whose own is unknown.
-        points: on the surface [m].
-        normals: unit, outward.
-        owner: number of the object; -1 on the table.
-        view: number of the photograph; exposure and white balance are those of the view.
-        shadows: what objects hide from lamps.
+        radiance: linear radiance, well exposed.
+        albedo: linear albedo; 1 on the table, whose albedo is unknown.
+        points: points on the surface [m].
+        normals: outward unit normals.
+        owner: index of the object; -1 on the table.
+        view: index of the photograph. Each view has its own exposure and white balance.
+        shadows: shadows that the objects cast.
     """
 
     radiance: Vectors
@@ -320,7 +321,7 @@ class LitPixels:
         return self.owner == TABLE
 
     def lifted(self) -> Vectors:
-        """Return points from which a lamp may be seen: off the surface where it could shade itself [m]."""
+        """Return the points moved off surfaces that could shade themselves [m]."""
         return np.where(self.on_table[:, None], self.points, self.shadows.lifted(self.points, self.normals))
 
     def about(self, count: int) -> LitPixels:
@@ -344,7 +345,7 @@ def object_pixels(photo: Photograph, found: PhotoObject, surfels: Surfels) -> Pi
     Args:
         photo: with a mask of the object.
         found: the object and its pose in the world.
-        surfels: of the object.
+        surfels: surfels of the object.
     """
     window, pose = object_windows([photo], found.name, _MASK_SIDE)[0], found.best.pose
     index, _ = draw(surfels, window, pose[None])
@@ -416,9 +417,9 @@ class LampShape:
     Attributes:
         centre: from which its direction and distance are counted [m].
         direction: unit vector from there toward the lamp.
-        inverse: of the distance [1/m].
+        inverse: inverse of the distance [1/m].
         aim: x and y of the point that it looks at, from the centre [m].
-        radius: of the pool of light around that point, where it ends [m]; None without a cone.
+        radius: radius of the pool of light around that point, where it ends [m]; None without a cone.
         inner_share: the inner half-angle of the cone over the outer one.
     """
 
@@ -508,10 +509,10 @@ class Gains:
     """Light of one scene.
 
     Attributes:
-        residual: radiance less what the light explains.
-        lamp: k of each view and colour; NaN where no object is seen.
-        ambient: a of them.
-        gradient: b of them, mean over views and colours.
+        residual: radiance minus the part that the light explains.
+        lamp: k of each view and colour; NaN if no object is visible.
+        ambient: a, of each view and colour.
+        gradient: b, mean over views and colours.
     """
 
     residual: Vectors
@@ -554,7 +555,7 @@ def _ridge(basis: Columns, albedo: PerPixel, target: PerPixel, weights: PerPixel
     return np.linalg.solve(normal, weighted.T @ target)
 
 
-# Where a lamp may stand: costs of lamps on some pixels, the comparison of all directions, refinement of one.
+# Search for the lamp: costs of lamps on some pixels, comparison of all directions, refinement of one lamp.
 
 
 _SEARCH_DIRECTIONS = 260  # on the sphere
@@ -569,7 +570,7 @@ class LampSearch:
     """Costs of lamps on the pixels of one scene.
 
     Args:
-        pixels: of the scene.
+        pixels: pixels of the scene.
     """
 
     def __init__(self, pixels: LitPixels) -> None:
@@ -743,13 +744,13 @@ class NearLampFit:
     """The lamp of one scene.
 
     Attributes:
-        shape: where it stands and what it looks at.
-        std: of its direction, per axis [rad].
-        log_distance_std: of the logarithm of its distance.
+        shape: position and aim of the lamp.
+        std: standard deviation of its direction, per axis [rad].
+        log_distance_std: standard deviation of the logarithm of its distance.
         strength: its light on a surface at the centre that faces it, per view and colour, where the radiance of white
             is 1: relative to the exposure, which is unknown. NaN where no object is seen.
         gain: share of the squared residual without a lamp that it explains.
-        is_diffuse: nothing speaks for a lamp; the rest then means little.
+        is_diffuse: whether there is no single lamp, so that the rest is unreliable.
     """
 
     shape: LampShape
@@ -766,7 +767,7 @@ class NearLampFit:
 
     @property
     def distance(self) -> float:
-        """Distance from the centre [m]; it means little if it is not known."""
+        """Distance from the centre [m]; unreliable unless `distance_known`."""
         return 1 / self.shape.inverse
 
     @property
@@ -776,9 +777,9 @@ class NearLampFit:
 
     @property
     def lamp(self) -> SpotLamp | None:
-        """Return the lamp over the table for renderers; None if its distance is not known, or it is too near or low.
+        """Return the lamp for renderers; None if its distance is not known, or it is too near or too low.
 
-        Without a cone in the photographs, it has a wide one.
+        If the photographs show no cone, it has a wide one.
         """
         place, cone = self.shape.place, self.shape.cone_rad
         distance = float(np.linalg.norm(place))
@@ -790,11 +791,11 @@ class NearLampFit:
 
 
 def fit_near_lamp(pixels: LitPixels, centre: Vector) -> NearLampFit:
-    """Find the lamp.
+    """Estimate the direction and the distance of the lamp.
 
     Args:
-        pixels: of all photographs of one scene.
-        centre: from which its direction and distance are counted [m], such as the table's centre.
+        pixels: pixels of all photographs of one scene.
+        centre: point from which direction and distance are measured [m], such as the table's centre.
     """
     start = _start(pixels, centre)
     search = LampSearch(pixels.about(_FINE_PIXELS))
@@ -864,12 +865,12 @@ def _covariance(residual: Vectors, jacobian: Jacobian, pixels: LitPixels) -> Flo
 
 
 def photo_light(photo: Photograph, objects: Sequence[PhotoObject], surfels: Sequence[Surfels]) -> LampFit:
-    """Find the direction toward a distant lamp in the world, from the objects' shading and the shadows between them.
+    """Estimate the direction toward a distant lamp in the world, from the objects' shading and their shadows.
 
     Args:
-        photo: with masks of the objects.
-        objects: what was found in it.
-        surfels: of each object.
+        photo: photo with masks of the objects.
+        objects: the objects that were found in it.
+        surfels: surfels of each object.
 
     Raises:
         InvalidInput: if too few pixels show objects that are trusted.
@@ -887,15 +888,15 @@ def photo_light(photo: Photograph, objects: Sequence[PhotoObject], surfels: Sequ
 def photo_lamp(
     photos: Sequence[Photograph], objects: Sequence[PhotoObject], surfels: Sequence[Surfels], *, covered_m: Sides = None
 ) -> NearLampFit:
-    """Find the lamp and its place, from objects, the shadows that they cast and the table where that is known.
+    """Estimate the lamp with its distance, from the objects, their shadows, and the table if it is known.
 
-    Its direction and distance are counted from the world's origin on a known table, else from the objects' centre.
+    Direction and distance are measured from the world's origin on a known table, else from the objects' centre.
 
     Args:
-        photos: of one scene, with masks of the objects.
-        objects: what was found in them.
-        surfels: of each object.
-        covered_m: sides of a print that lies around the world's origin and hides the table, along x and y [m].
+        photos: photos of one scene, with masks of the objects.
+        objects: the objects that were found in them.
+        surfels: surfels of each object.
+        covered_m: sides along x and y of a printed board around the world's origin, which hides the table [m].
 
     Raises:
         InvalidInput: if too few pixels show anything known.

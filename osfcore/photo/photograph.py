@@ -1,4 +1,4 @@
-"""A photograph as the rest of the program sees it: linear radiance, camera, and where its objects are."""
+"""A photograph in the form that the program uses: linear radiance, camera, and masks of its objects."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]  # by name of the object
 
 @dataclass(frozen=True, slots=True)
 class WindowFrame:
-    """Which part of a photograph a window shows, and its size; it may reach beyond the photograph.
+    """The part of a photograph that a window shows, and the size of the window. It may reach beyond the photograph.
 
     Attributes:
-        left, top, right, bottom: of the part, the last two not included [px of the photograph].
-        width, height: of the window [px].
+        left, top, right, bottom: borders of the part, the last two not included [px of the photograph].
+        width, height: size of the window [px].
     """
 
     left: int
@@ -48,7 +48,7 @@ class WindowFrame:
         return moved * np.array(scale)
 
     def placed(self, share: Float32[np.ndarray, "a b"], shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
-        """Return which pixels of the whole photograph more than half of a window's pixels there mark."""
+        """Return the pixels of the whole photograph of which a window marks more than half."""
         whole = cv2.resize(share, (self.right - self.left, self.bottom - self.top)) > 0.5
         top, left = max(self.top, 0), max(self.left, 0)
         bottom, right = min(self.bottom, shape[0]), min(self.right, shape[1])
@@ -63,11 +63,11 @@ class Photograph:
 
     Attributes:
         image: linear radiance in [0, 1].
-        well_exposed: where the radiance was measured: no channel saturated, not all of them black.
+        well_exposed: pixels whose radiance was measured: no channel is saturated, and not all are black.
         intrinsics: K, focal lengths and principal point [px], pixel centres at +0.5.
-        T_world_camera: pose of the camera, OpenCV axes.
+        T_world_camera: pose of the camera in the world, OpenCV axes.
         on_table: whether the world's z = 0 is the table's plane; if not, the world is the camera's own frame.
-        masks: which pixels show an object, by its name.
+        masks: pixels that show an object, by its name.
     """
 
     image: Float32[np.ndarray, "h w 3"]
@@ -117,13 +117,13 @@ class Photograph:
         return replace(self, masks=dict(masks))
 
     def resized(self, longest: int) -> Photograph:
-        """Return the same view with fewer pixels; one that is small enough already stays as it is.
+        """Return the same view with fewer pixels. A small photograph is not changed.
 
         Radiance is averaged over the area of each new pixel. A new pixel belongs to a mask if more than half of its
         area does, and is well exposed only if all of its area is.
 
         Args:
-            longest: side of the new image [px].
+            longest: longest side of the new image [px].
 
         Raises:
             InvalidInput: if `longest` is not positive, or so small that nothing is left of a mask.

@@ -1,4 +1,4 @@
-"""How well an object in a pose explains photographs: its outline, shading and texture, compared by surfels."""
+"""The loss of an object's pose in photographs: outline, shading and texture, compared by surfels."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def compare_poses(
     Args:
         points, normals, albedo, half: surfels, see `draw_surfels`.
         rotations, positions: B x 3 x 3 and B x 3, from the object's frame to the camera's.
-        lens: of the window.
+        lens: lens of the window.
         image, luminance: linear radiance, h x w x 3, and its mean over colours.
         mask, known, plain: pixels of the object; pixels where that is known; well exposed pixels within the mask.
         terms: B x 4, results.
@@ -249,7 +249,7 @@ def draw_poses(points, normals, half, rotations, positions, lens, nearest, index
         draw_surfels(points, normals, half, rotations[b], positions[b], lens, nearest[b], index[b])
 
 
-# Surfels of a field: points of its surface with normal and albedo, a stand-in for it that draws in a millisecond.
+# Surfels of a field: points of its surface with normal and albedo, which are drawn in a millisecond.
 #
 # The surface is where rays from outside have lost half of their light (transmittance 1/2). The normal is the
 # direction of the field's dipole; the albedo is the field's radiance where light and view both fall along the
@@ -287,7 +287,7 @@ def surfels_of(field: KiloOSF, spacing: float) -> Surfels:
     """Sample the surface of a field.
 
     Args:
-        field: of the object.
+        field: field of the object.
         spacing: wanted distance between points [m].
     """
     low, high = field.extent
@@ -361,11 +361,11 @@ class ObjectWindow:
         image: linear radiance.
         luminance: its mean over colours.
         mask: pixels of the object.
-        known: pixels of which the mask decides whether they show the object: none that another object may hide, none
-            outside the photograph.
+        known: pixels at which the mask is known. Pixels that another object may hide, or outside the photograph, are
+            not.
         plain: well exposed pixels within the mask, one pixel away from its border.
         signed_distance: to the mask's border, positive inside [px].
-        intrinsics: of the window [px].
+        intrinsics: intrinsics of the window [px].
         T_camera_world: the inverse of the camera's pose.
         cut: share of the mask's border that lies on the photograph's edge.
         frame: which part of the photograph it is.
@@ -404,9 +404,9 @@ def object_windows(photos: Sequence[Photograph], name: str, side: int) -> tuple[
     """Cut a window out of each photograph with a mask of the object.
 
     Args:
-        photos: of one scene.
-        name: of the object.
-        side: longest side that the mask shall have [px]; smaller masks are not enlarged.
+        photos: photos of one scene.
+        name: name of the object.
+        side: longest side of the mask in the window [px]. Smaller masks are not enlarged.
 
     Raises:
         InvalidInput: if no photograph has a mask of the object, or it has too few pixels.
@@ -461,7 +461,7 @@ def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]
     return np.where(mask, inside - 0.5, 0.5 - outside).astype(np.float32)
 
 
-# Prior on an object's pose over a known table: it probably stands on it, in one of its stable orientations.
+# Prior on an object's pose over a known table: it probably stands on the table in one of its stable orientations.
 
 
 _HEIGHT_STD_M = 2e-3
@@ -477,7 +477,7 @@ class TablePrior:
     Beyond ten standard deviations the penalty is constant: objects may lie on objects.
 
     Args:
-        resting: how the object can lie.
+        resting: resting orientations of the object.
     """
 
     def __init__(self, resting: RestingOrientations) -> None:
@@ -518,7 +518,7 @@ class TablePrior:
         return jacobian.T @ jacobian, -jacobian.T @ np.array(residuals)
 
 
-# How well an object in a pose explains photographs: outline, shading and texture.
+# The loss of an object's pose in photographs: outline, shading and texture.
 #
 #     L = (1 - IoU) + w_r * residual + w_c * (1 - correlation) [+ w_p * penalty of the table]
 #
@@ -544,8 +544,8 @@ class PoseTerms:
     Attributes:
         iou: intersection over union of drawn outline and mask.
         residual: relative error of the colours.
-        correlation: of the band-passed images.
-        losses: the whole.
+        correlation: correlation of the band-passed images.
+        losses: total losses.
     """
 
     iou: Float[np.ndarray, "B"]
@@ -559,9 +559,9 @@ class PoseLoss:
     """The loss of one object's poses in the world.
 
     Attributes:
-        windows: of the photographs.
-        surfels: of the object.
-        table: prior of the known table; None where it is not known.
+        windows: windows of the photographs.
+        surfels: surfels of the object.
+        table: prior of the known table; None if the table is not known.
         kind: "all", or "iou" for the outline alone, as in the paper.
     """
 

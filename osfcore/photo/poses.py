@@ -57,7 +57,7 @@ Losses = Float[np.ndarray, "K"]
 #
 # phi and phi_drawn the signed distances to the borders of the mask and of the drawn outline. A mask whose border is
 # off by a constant is marginalised where the table fixes how large an object appears. xi is a shift in the world
-# and a turn about the object's origin. Which surfels are visible is found anew at each step and frozen within it.
+# and a turn about the object's origin. Visibility of surfels is determined at each step and fixed within it.
 
 
 _ITERATIONS = 40
@@ -92,9 +92,9 @@ def align(loss: PoseLoss, start: Pose) -> tuple[Pose, float]:
     """Refine one pose.
 
     Args:
-        loss: whose windows, surfels and table are used. It decides in the end: a result that is clearly worse than the
-            best pose on the way gives way to that one.
-        start: near the solution: about a centimetre and ten degrees.
+        loss: loss whose windows, surfels and table are used. If the result is clearly worse by it than the best pose on
+            the way, that pose is returned.
+        start: initial pose, within about a centimetre and ten degrees of the solution.
 
     Returns:
         The pose and its loss.
@@ -189,7 +189,7 @@ def _tukey(residual: np.ndarray, std: float) -> np.ndarray:
 
 
 def _outline_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray, border_std_px: float) -> Pair:
-    """Return the outline's normal equations; a border of the mask that is off by a constant is marginalised."""
+    """Return the normal equations of the outline. A constant offset of the mask's border is marginalised."""
     shown = index >= 0
     border = shown & (cv2.erode(shown.astype(np.uint8), _CROSS) == 0) & part.clear
     pixels, jacobian = _project(part.window, pose, surfels.points[index[border]])
@@ -282,10 +282,10 @@ def poses_around(pose: Pose, window: ObjectWindow, count: int, rng: np.random.Ge
     """Draw poses around a given one, itself first: about 1.5 cm sideways, 4 % nearer or farther, 15 degrees turned.
 
     Args:
-        pose: of one object in the world.
-        window: of the photograph whose camera says what is sideways.
-        count: of poses.
-        rng: of the draws.
+        pose: pose of one object in the world.
+        window: window of the photograph whose camera says what is sideways.
+        count: number of poses.
+        rng: random generator of the draws.
     """
     depth = (window.T_camera_world @ pose).position[2]
     scales = np.array([_AROUND_LATERAL_M, _AROUND_LATERAL_M, _AROUND_DEPTH_SHARE * depth, *[_AROUND_TURN_RAD] * 3])
@@ -320,7 +320,7 @@ def cma_search(loss: PoseLoss, starts: Pose, spread: float, rng: np.random.Gener
         loss: what is minimised.
         starts: K poses.
         spread: first standard deviation, as a multiple of 2 pixels sideways, 3 % of the depth and 0.15 rad.
-        rng: of the searches.
+        rng: random generator of the searches.
 
     Returns:
         The best pose of each search and its loss.
@@ -346,7 +346,7 @@ def cma_search(loss: PoseLoss, starts: Pose, spread: float, rng: np.random.Gener
     return Pose(position, quaternion), least
 
 
-# The table's plane from how objects lie: most stand in a stable orientation, on one plane.
+# The table's plane from the objects: most of them stand in a stable orientation, on one plane.
 
 
 _AGREE_DEG = 12.0
@@ -357,12 +357,12 @@ _DOWNWARD = np.array([0.0, 1.0, 0.5])  # in a camera's frame: it looks ahead and
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TableGuess:
-    """A table that objects lie on.
+    """A table found from the objects on it.
 
     Attributes:
-        T_world_camera: such that it is z = 0, its origin below the objects' mean.
-        spread_deg: of the objects' verticals around their mean, root mean square.
-        supported: numbers of the objects that lie on it.
+        T_world_camera: pose of the camera in a world whose z = 0 is the table, with its origin below the objects' mean.
+        spread_deg: spread of the objects' verticals around their mean, root mean square.
+        supported: indices of the objects that stand on it.
     """
 
     T_world_camera: Pose
@@ -373,12 +373,12 @@ class TableGuess:
 def table_from_objects(priors: Sequence[TablePrior], poses: Sequence[Pose]) -> TableGuess | None:
     """Find the plane that most objects stand on; None if fewer than two agree.
 
-    The vertical is the direction that a stable orientation of most objects agrees with within 12 degrees; the plane is
-    at the median of their lowest points, of which those within 2 cm count.
+    The vertical is the direction that agrees within 12 degrees with a stable orientation of most objects. The plane
+    lies at the median of their lowest points; objects within 2 cm of it count as standing on it.
 
     Args:
-        priors: of each object.
-        poses: of each object in the camera's frame.
+        priors: priors of each object.
+        poses: poses of each object in the camera's frame.
     """
     options = [prior.downs(pose) for prior, pose in zip(priors, poses, strict=True)]
     options = [o[o @ _DOWNWARD > 0] for o in options]
@@ -416,11 +416,11 @@ def _frame(right: np.ndarray, ahead: np.ndarray, up: np.ndarray, origin: np.ndar
     return Pose.from_matrix(matrix).inverse()
 
 
-# A focal length that nobody knows: the one at which objects explain the photograph best and stand on one table.
+# An unknown focal length: the one at which objects explain the photograph best and stand on one table.
 #
-# Seen through a lens of another focal length each object fits its mask nearly as well, nearer or farther, and turned
-# with the ray that leads to it; but then objects in different places no longer agree on the vertical and the plane. For
-# each focal length f of a grid, with the table that the objects found there agree on, the cost is
+# With a wrong focal length each object still fits its mask nearly as well, at another distance and turned with its
+# viewing ray. But objects in different places then disagree on the vertical and the plane. For each focal length f of a
+# grid, with the table that the objects agree on, the cost is
 #
 #     S(f) = sum_k [ L_k(f) + w (height_k^2 / s_h^2 + tilt_k^2 / s_t^2) ],
 #
@@ -434,7 +434,7 @@ _NOT_ON_TABLE = 10.0  # of an object where no table is found
 
 
 class _FocalSearch:
-    """Tries focal lengths; `photo` knows no table, and its focal length is a guess with which `found` was found."""
+    """Tries focal lengths. `photo` has no known table; `found` was found with a guess of its focal length."""
 
     def __init__(
         self, models: PhotoModels, photo: Photograph, found: Sequence[PhotoObject], config: PhotoConfig
@@ -443,7 +443,7 @@ class _FocalSearch:
         self._costs: dict[float, float] = {}
 
     def try_out(self, focal: float) -> None:
-        """Find the cost of a focal length [px]."""
+        """Return the cost of a focal length [px]."""
         poses, losses = [], []
         for one in self._found:
             pose, loss = self._aligned(one, one.best.pose, focal)
@@ -458,7 +458,7 @@ class _FocalSearch:
             self._costs[focal] = sum(losses) + _ON_TABLE_WEIGHT * off
 
     def best(self) -> float | None:
-        """Return the focal length of least cost [px]; None if that is at an end of the grid, or none has a table."""
+        """Return the focal length of least cost [px]; None if it is at an end of the grid, or no table was found."""
         focals = np.array(sorted(self._costs))
         costs = np.array([self._costs[focal] for focal in focals])
         k = int(np.argmin(costs))
@@ -469,7 +469,7 @@ class _FocalSearch:
         return float(focals[k] * (focals[k + 1] / focals[k]) ** np.clip(shift, -0.5, 0.5))
 
     def moved(self, one: PhotoObject, focal: float) -> PhotoObject:
-        """Return an object with its poses as a camera of that focal length sees it, the best first."""
+        """Return an object with its poses for a camera of this focal length, the best first."""
         loss = self._loss(one, focal)
         poses = Pose.stacked(self._aligned(one, each.pose, focal)[0] for each in (one.best, *one.rivals))
         ready = _photo_poses(poses, loss)
@@ -492,12 +492,12 @@ def _with_focal(K: Intrinsics, focal: float) -> Intrinsics:
 
 
 def seen_through(pose: Pose, before: Intrinsics, after: Intrinsics) -> Pose:
-    """Return the pose at which another lens shows an object as large, in the same place and from the same side.
+    """Return the pose at which another lens shows an object at the same size, in the same place and from the same side.
 
     Args:
-        pose: in the camera's frame.
-        before: K of the lens through which it is seen there.
-        after: K of the other.
+        pose: pose in the frame of the camera with the first lens.
+        before: K of the first lens [px].
+        after: K of the other lens [px].
     """
     ray = pose.position / pose.position[2]
     other = np.linalg.solve(after, before @ ray)
@@ -523,8 +523,8 @@ def table_from_points(points_camera: Float[np.ndarray, "P 3"], rng: np.random.Ge
     The world's origin is the inliers' mean; z points from the plane to the camera's side.
 
     Args:
-        points_camera: most of them on the table, in the camera's frame [m].
-        rng: of the draws.
+        points_camera: points in the camera's frame, most of them on the table [m].
+        rng: random generator of the draws.
 
     Raises:
         InvalidInput: if there are fewer than 50 points, or less than 30 % lie on one plane.
@@ -560,10 +560,10 @@ class PhotoPose:
 
     Attributes:
         pose: `T_world_object`.
-        loss: of `PoseLoss`.
-        iou: of drawn outline and mask.
+        loss: loss of `PoseLoss`.
+        iou: intersection over union of drawn outline and mask.
         residual: relative error of the colours.
-        correlation: of the band-passed images.
+        correlation: correlation of the band-passed images.
     """
 
     pose: Pose
@@ -575,15 +575,15 @@ class PhotoPose:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PhotoObject:
-    """One object that was looked for.
+    """One object that was searched in the photographs.
 
     Attributes:
-        name: of the object.
+        name: name of the object.
         best: the most likely pose.
-        rivals: other orientations, the best first; a person may choose one.
-        doubt: why it should not be trusted, in a sentence; "" where it may be.
+        rivals: other orientations, the best first, from which a person may choose.
+        doubt: why the pose should not be trusted, in one sentence; "" if it can be.
         coarse_s: duration of the search over rotations [s].
-        refine_s: of the refinement [s].
+        refine_s: duration of the refinement [s].
     """
 
     name: str
@@ -599,10 +599,10 @@ class PhotoStep:
     """One step of the estimation.
 
     Attributes:
-        progress: how far the work is.
-        found: objects so far, in the photographs' world.
-        table: on which objects were found to lie, where no photograph shows a board; with the last step only.
-        intrinsics: K with the focal length at which they lie on it, if that was unknown [px]; with the last step only.
+        progress: how far the work has come.
+        found: objects found so far, in the photographs' world.
+        table: table found from the objects if no photograph shows a board; only in the last step.
+        intrinsics: K with the focal length found from the objects, if it was unknown [px]; only in the last step.
     """
 
     progress: Progress
@@ -611,11 +611,11 @@ class PhotoStep:
     intrinsics: Intrinsics | None = None
 
     def as_seen(self, photo: Photograph) -> Photograph:
-        """Return the photograph with the focal length that was found, if one was."""
+        """Return the photograph with the focal length that was found, if there is one."""
         return photo if self.intrinsics is None else replace(photo, intrinsics=self.intrinsics)
 
 
-# Why a pose in a photograph should not be trusted, in a sentence.
+# Reasons not to trust a pose in a photograph, one sentence each.
 
 
 LEAST_RATIO = 1.15  # loss of another orientation over that of the best
@@ -625,7 +625,7 @@ _MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
 
 
 def fits_outline(best: PhotoPose) -> bool:
-    """Return whether the drawn outline is that of the mask."""
+    """Return whether the drawn outline fits the mask."""
     return best.iou >= _LEAST_IOU
 
 
@@ -633,10 +633,10 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
     """Return the first reason for doubt that applies; "" if none does.
 
     Args:
-        name: of the object.
+        name: name of the object.
         best: its pose.
         rivals: other orientations, the best first.
-        loss: whose windows the pose was found in.
+        loss: loss whose windows the pose was found in.
     """
     if not fits_outline(best):
         share = f"they share {100 * best.iou:.0f} %"
@@ -650,7 +650,7 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
     return ""
 
 
-# Masks of an object once the others are found: what lies in front of it spoils a mask that was proposed from a box.
+# Masks of an object once the others are found: objects in front of it spoil a mask that was proposed from a box.
 
 
 _SIDE = 240  # of a mask whose object is drawn [px]
@@ -659,16 +659,16 @@ _SIDE = 240  # of a mask whose object is drawn [px]
 def without_others(
     photos: Sequence[Photograph], name: str, found: Sequence[PhotoObject], surfels: Mapping[str, Surfels]
 ) -> list[Photograph]:
-    """Return photographs in which the others' masks hold whatever may hide an object, and its own mask none of it.
+    """Return photographs in which an object's mask contains no other object.
 
-    An outline drawn in the pose that was found is added to each other's mask. What such an outline and a mask that it
-    fits both claim is taken from the object's own.
+    The outline of each other object, drawn in its found pose, is added to that object's mask. Pixels of an outline that
+    fits its mask are removed from the mask of the object `name`.
 
     Args:
-        photos: with masks.
-        name: of the object; photographs without a mask of it are left as they are.
+        photos: photos with masks.
+        name: name of the object. Photographs without a mask of it are not changed.
         found: all objects.
-        surfels: of each object, by name.
+        surfels: surfels of each object, by name.
     """
     seen = []
     for photo in photos:
@@ -689,10 +689,10 @@ def without_others(
 
 # Poses of known objects in photographs: from masks and fields alone, or from poses that another program gives.
 #
-# For each object: candidates (all rotations, put where the mask is, or poses around a given one) are ranked in a
-# small window by outline, shading and texture (`PoseLoss`); CMA-ES refines the best that differ, in the small
-# window and then in a finer one; Gauss-Newton aligns the best of these (`align`). Cameras and masks are
-# given, the light need not be known.
+# For each object, candidates are ranked in a small window by outline, shading and texture (`PoseLoss`). Candidates are
+# all rotations at the place of the mask, or poses around a given one. CMA-ES refines the best distinct candidates in
+# the small window and then in a finer one. Gauss-Newton aligns the best of these (`align`). Cameras and masks must be
+# given; the light need not be known.
 
 
 _COARSE_SIDE, _FINE_SIDE, _SHARP_SIDE = 44, 130, 240  # of a mask [px]
@@ -708,12 +708,13 @@ _ALIGNED = 4
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PhotoConfig:
-    """How objects are looked for.
+    """Settings of `estimate_photo`.
 
     Attributes:
-        starts: poses in the world to begin with, by object name; objects without one are looked for in all rotations.
+        starts: initial poses `T_world_object`, by name of the object; objects without one are searched in all
+            rotations.
         loss: "all", or "iou" for the outline alone, as in the paper.
-        focal_known: whether the photograph's focal length is more than a guess.
+        focal_known: whether the photograph's focal length is known and not a guess.
     """
 
     starts: Mapping[str, Pose] = field(default_factory=dict)
@@ -722,10 +723,10 @@ class PhotoConfig:
 
 
 class PhotoModels:
-    """Surfels and stable orientations of fields, made when first asked for.
+    """Surfels and stable orientations of fields, computed when they are first needed.
 
     Args:
-        fields: by name of the object.
+        fields: fields of the objects, by name.
     """
 
     def __init__(self, fields: Mapping[str, KiloOSF]) -> None:
@@ -734,7 +735,7 @@ class PhotoModels:
         self._priors: dict[str, TablePrior] = {}
 
     def check(self, name: str) -> None:
-        """Refuse an object without a field.
+        """Check that an object has a field.
 
         Raises:
             UnknownName: if it has none.
@@ -763,14 +764,14 @@ class PhotoModels:
 def estimate_photo(
     models: PhotoModels, photos: Photos, names: Sequence[str], rng: Rng, config: PhotoConfig | None = None
 ) -> Iterator[PhotoStep]:
-    """Find objects one after the other; the last step holds all.
+    """Find objects in photos, one after the other. The last step has all of them.
 
     Args:
-        models: of the objects.
-        photos: of one scene; each object has a mask in at least one.
-        names: of the objects.
-        rng: of the searches.
-        config: how to look.
+        models: models of the objects.
+        photos: photos of one scene; each object has a mask in at least one.
+        names: names of the objects.
+        rng: random generator of the searches.
+        config: settings.
 
     Raises:
         UnknownName: if an object has no field.
@@ -819,7 +820,7 @@ def estimate_photo(
 def _found_behind(
     models: PhotoModels, photos: Photos, found: Sequence[PhotoObject], number: int, rng: Rng, config: PhotoConfig
 ) -> tuple[PhotoObject, Photos]:
-    """Look for an object in masks without the others; return these too, or all as before if it fits no better."""
+    """Search an object in masks without the others; return both, or the old ones if it fits no better."""
     before = found[number]
     surfels = {other.name: models.surfels(other.name, FINE_ACROSS) for other in found}
     without = without_others(photos, before.name, found, surfels)
@@ -833,7 +834,7 @@ def _found_behind(
 def _on_table(
     models: PhotoModels, photo: Photograph, found: PhotoObject, table: TableGuess, config: PhotoConfig
 ) -> PhotoObject:
-    """Align an object once more, now that it is known to lie on a table; its pose stays in the camera's frame."""
+    """Align an object again with a known table. Its pose stays in the camera's frame."""
     start, surfels = time.perf_counter(), models.surfels(found.name, FINE_ACROSS)
     seen = object_windows([replace(photo, T_world_camera=table.T_world_camera, on_table=True)], found.name, _SHARP_SIDE)
     sharp = PoseLoss(seen, surfels, models.table_prior(found.name), config.loss)
@@ -852,7 +853,7 @@ def _photo_poses(poses: Pose, loss: PoseLoss) -> list[PhotoPose]:
 
 
 def find_object(models: PhotoModels, photos: Photos, name: str, rng: Rng, config: PhotoConfig) -> PhotoObject:
-    """Look for one object in its masks; arguments as of `estimate_photo`."""
+    """Search one object in its masks. Arguments are as in `estimate_photo`."""
     on_table = all(photo.on_table for photo in photos)
     table = models.table_prior(name) if on_table else None
     coarse, fine, sharp = (

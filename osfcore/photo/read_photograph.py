@@ -1,6 +1,6 @@
-"""Picture files that people send: decoded upright, at a moderate size, with what EXIF says of the focal length.
+"""Reading photos that people send: upright, at a moderate size, with the focal length from EXIF data.
 
-A file is judged by its header first, and whatever a decoder stumbles over becomes one sentence.
+The header of a file is checked first. Every error of a decoder becomes one sentence.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class RawPhotograph:
     """A decoded photo, upright.
 
     Attributes:
-        encoded: values as the file holds them, in the primaries of sRGB; perhaps scaled down.
-        encoding: of these values.
+        encoded: values of the file, in the primaries of sRGB; perhaps scaled down.
+        encoding: encoding of these values.
         sent_size: width and height of the upright photo as it was sent [px].
-        focal_px: focal length in pixels of `encoded`, from EXIF; None if that lacks it.
+        focal_px: focal length in pixels of `encoded`, from EXIF; None if it is missing there.
         notes: sentences for the user about what was done to the photo.
     """
 
@@ -62,7 +62,7 @@ class RawPhotograph:
 
     @property
     def eight_bit(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The encoded values in 8 bit, to look at."""
+        """The encoded values as 8-bit values, for people to look at."""
         if self.encoded.dtype == np.uint8:
             return self.encoded
         return ((self.encoded.astype(np.uint32) + 128) // 257).astype(np.uint8)
@@ -71,16 +71,16 @@ class RawPhotograph:
 def read_photograph(data: bytes | Path, *, encoding: Encoding = "srgb", most_pixels: int = MAX_PIXELS) -> RawPhotograph:
     """Read a photo in any usual format, upright, no side longer than 2048 px.
 
-    Grey, palettes, CMYK and 16 bits a channel (which PNG and grey TIFF keep) are understood; what is transparent
-    becomes white; 8-bit colours of another profile are converted to sRGB; of an animation the first image counts.
+    It reads grey images, palettes, CMYK, and 16 bits a channel (in PNG and grey TIFF). Transparent parts become white.
+    8-bit colours of another profile are converted to sRGB. Of an animation, the first image is used.
 
     Args:
-        data: the file, or its content.
-        encoding: what its values mean.
-        most_pixels: that it may have.
+        data: the file, or its contents.
+        encoding: encoding of its values.
+        most_pixels: largest number of pixels.
 
     Raises:
-        CorruptFile: if it is no such image, is broken, or has too many or too few pixels.
+        CorruptFile: if it is no such image, is damaged, or has too many or too few pixels.
     """
     name, content = ("The photo", data) if isinstance(data, bytes) else (shown(data), content_of(data, data, MAX_BYTES))
     allowed = f"{most_pixels // 1_000_000} million are allowed"
@@ -99,16 +99,16 @@ def read_photograph(data: bytes | Path, *, encoding: Encoding = "srgb", most_pix
     except MemoryError:
         raise CorruptFile(name, "it needs too much memory to be decoded; take a smaller one") from None
     except Image.DecompressionBombError:  # the decoders of WebP and GIF have a limit of their own, below ours
-        raise CorruptFile(name, "it has more pixels than its format may have here; send it as a JPEG") from None
+        raise CorruptFile(name, "it has too many pixels for its format; send it as a JPEG") from None
     except Exception:  # decoders raise whatever their own code stumbles over
-        raise CorruptFile(name, "it is damaged or incomplete, and cannot be decoded; send it anew") from None
+        raise CorruptFile(name, "it is damaged or incomplete, and cannot be decoded; send it again") from None
 
 
 def content_of(path: Path, name: Path | str, most: int) -> bytes:
-    """Read a file of at most so many bytes.
+    """Return the contents of a file of at most `most` bytes.
 
     Raises:
-        CorruptFile: under this name, if it cannot be read or is larger.
+        CorruptFile: if it cannot be read or is larger; the message uses `name`.
     """
     try:
         if path.stat().st_size > most:
@@ -119,7 +119,7 @@ def content_of(path: Path, name: Path | str, most: int) -> bytes:
 
 
 class _LargeTiff(TiffImageFile):
-    """A TIFF of any size: its pixels have been counted before they are decoded."""
+    """A TIFF without Pillow's limit on its size; its pixels are counted before they are decoded."""
 
     def load_prepare(self) -> None:
         if self._im is None:
@@ -146,7 +146,7 @@ _quiet_lock, _quiet_threads, _filters = threading.Lock(), 0, contextlib.ExitStac
 
 @contextlib.contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Ignore what Pillow thinks of odd metadata; filters belong to all threads, so the last one restores them."""
+    """Ignore Pillow's warnings about odd metadata. All threads share the filters, so the last one restores them."""
     global _quiet_threads
     with _quiet_lock:
         if _quiet_threads == 0:
@@ -162,7 +162,7 @@ def _without_warnings() -> Iterator[None]:
 
 
 def intrinsics_from_focal(width: int, height: int, focal_px: float) -> Intrinsics:
-    """Return K of a camera with square pixels that looks through the middle of its image; pixel centres at +0.5.
+    """Return K of a camera with square pixels and its principal point in the middle; pixel centres at +0.5.
 
     Raises:
         InvalidInput: if the focal length is less than a fifth of the image's longest side, or more than 50 times that.
@@ -173,27 +173,27 @@ def intrinsics_from_focal(width: int, height: int, focal_px: float) -> Intrinsic
 
 
 def guessed_intrinsics(raw: RawPhotograph) -> tuple[Intrinsics, str]:
-    """Return K as EXIF has it, else that of a phone's main camera, and a sentence that says which."""
+    """Return K from EXIF data, or else that of a phone's main camera, and a note that names the source."""
     height, width = raw.encoded.shape[:2]
     if raw.focal_px is not None:
-        note = f"The focal length, {raw.focal_px:.0f} pixels, is what the camera wrote into the photo."
+        note = f"The focal length, {raw.focal_px:.0f} pixels, comes from the photo's EXIF data."
         return intrinsics_from_focal(width, height, raw.focal_px), note
     focal = np.hypot(width, height) / 2 / np.tan(np.deg2rad(ASSUMED_DIAGONAL_DEG) / 2)
     phone = f"that of a phone's main camera is assumed ({ASSUMED_DIAGONAL_DEG:g} degrees from corner to corner)"
-    note = f"The photo does not say its focal length; {phone}, unless two or more objects show another one."
+    note = f"The photo has no focal length; {phone}, unless two or more objects show another one."
     return intrinsics_from_focal(width, height, float(focal)), note
 
 
 def to_photograph(
     raw: RawPhotograph, intrinsics: Intrinsics, T_world_camera: Pose | None = None, masks: Masks | None = None
 ) -> Photograph:
-    """Compute the linear radiance of a decoded photo, and which of its pixels can be trusted.
+    """Return the linear radiance of a decoded photo, and which of its pixels are well exposed.
 
     Args:
-        raw: as it was read.
+        raw: the photo as it was read.
         intrinsics: K of `raw.encoded` [px].
-        T_world_camera: pose over the table's plane z = 0; None if no table is known.
-        masks: by object name.
+        T_world_camera: pose of the camera over the table's plane z = 0; None if the table is not known.
+        masks: masks of the objects, by name.
 
     Raises:
         InvalidInput: if intrinsics, pose or masks do not fit the photo.
@@ -233,7 +233,7 @@ def _eight_bit_rgb(image: Image.Image, encoding: Encoding) -> tuple[UInt8[np.nda
     notes: list[str] = []
     if mode == "RGBA":
         if np.asarray(plain.getchannel("A")).min() < 255:
-            notes.append("Transparent parts of the photo were taken for white.")
+            notes.append("Transparent parts of the photo are read as white.")
         plain = Image.alpha_composite(Image.new("RGBA", plain.size, "white"), plain).convert("RGB")
     profile = image.info.get("icc_profile")
     if profile and encoding == "srgb" and image.mode in ("RGB", "RGBA"):
@@ -243,7 +243,7 @@ def _eight_bit_rgb(image: Image.Image, encoding: Encoding) -> tuple[UInt8[np.nda
 
 
 def _in_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, str]:
-    """Convert the colours that a profile stands for: phones write a wider gamut than sRGB."""
+    """Convert colours from the photo's profile to sRGB, since phones write a wider gamut."""
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         name = shown(ImageCms.getProfileDescription(source).strip())
@@ -253,11 +253,11 @@ def _in_srgb(image: Image.Image, profile: bytes) -> tuple[Image.Image, str]:
         assert converted is not None
         return converted, f"The photo's colours were converted from {name} to sRGB."
     except Exception:  # profiles may be wrong in as many ways as other metadata
-        return image, "The photo's colour profile cannot be understood; its colours are taken for sRGB."
+        return image, "The photo's colour profile cannot be read; its colours are read as sRGB."
 
 
 def _sixteen_bit(image: Image.Image, content: bytes) -> UInt16[np.ndarray, "h w 3"]:
-    """Decode all sixteen bits, of which Pillow keeps half unless the image is grey; what is transparent is white."""
+    """Decode all sixteen bits, of which Pillow keeps only eight in colour images. Transparent parts become white."""
     image.load()  # finds out damage, which OpenCV passes over
     if image.mode in _WIDE_MODES:
         values = np.asarray(image).astype(np.uint16)
@@ -280,7 +280,7 @@ def _sixteen_bit(image: Image.Image, content: bytes) -> UInt16[np.ndarray, "h w 
 
 
 def _orientation(image: Image.Image) -> int:
-    """Return EXIF's orientation; 1 if its metadata cannot be understood (ImageOps gives up)."""
+    """Return EXIF's orientation; 1 if the metadata cannot be read (ImageOps then fails)."""
     try:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
         return orientation if orientation in _UPRIGHT else 1
@@ -289,7 +289,7 @@ def _orientation(image: Image.Image) -> int:
 
 
 def _focal_per_diagonal(image: Image.Image) -> float | None:
-    """Return the focal length for each pixel of the diagonal, from EXIF; None if that lacks it, or is not sane."""
+    """Return the focal length in units of the diagonal, from EXIF; None if it is missing or implausible."""
     width, height = image.size
     diagonal = float(np.hypot(width, height))
     try:

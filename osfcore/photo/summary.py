@@ -1,4 +1,4 @@
-"""The result of an estimation for files and people: poses, lamp, camera, and sentences."""
+"""The result of an estimation in a form for files and people: poses, lamp, camera, and notes."""
 
 from __future__ import annotations
 
@@ -30,45 +30,43 @@ from osfcore.photo.photograph import Photograph
 from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, PhotoPose, PhotoStep
 from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, intrinsics_from_focal
 
-# The summary of an estimation: poses on the table where one is known, lamp, camera, and sentences for the user.
+# The summary of an estimation: poses on the table if it is known, lamp, camera, and notes for the user.
 
 
 def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels, notes: Sequence[str]) -> FoundScene:
     """Summarise an estimation.
 
     Args:
-        photos: of one table.
-        step: the last one.
-        models: of the objects.
+        photos: photos of one table.
+        step: the last step of the estimation.
+        models: models of the objects.
         notes: sentences for the user about the photo.
     """
     T_table_world, table, notes = Pose.identity(), "board" if photos[0].on_table else None, list(notes)
     if step.table is not None:
         T_table_world, table = step.table.T_world_camera, "objects"
-        seen = f"{len(step.table.supported)} objects lie, whose verticals differ by {step.table.spread_deg:.1f} degrees"
-        notes.append(f"The table was found from how {seen}; it may be off by a few.")
+        seen = f"{len(step.table.supported)} objects, whose vertical axes differ by {step.table.spread_deg:.1f} degrees"
+        notes.append(f"The table was found from {seen}; its tilt may be off by a few degrees.")
     if step.intrinsics is not None:
         focal = f"{step.intrinsics[0, 0]:.0f} pixels"
-        notes.append(
-            f"The focal length, {focal}, is that at which the objects stand on one table; it may be off by a fifth."
-        )
+        notes.append(f"The focal length, {focal}, was found from how the objects stand; it may be off by a fifth.")
     light = None
     try:
         light, unknown = _light(photos, step, models)
         notes += unknown
     except InvalidInput as error:
-        notes.append(f"The light cannot be told: {error}")
+        notes.append(f"The light could not be determined: {error}")
     first, *others = [_camera(number, T_table_world, photo) for number, photo in enumerate(photos, 1)]
     objects = [_found(T_table_world, each) for each in step.found]
     return FoundScene(table=table, objects=objects, light=light, camera=first, other_cameras=others, notes=notes)
 
 
 def _light(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels) -> tuple[FoundLight, list[str]]:
-    """Find the lamp in the frame of the table where there is one; also sentences on what is not known of it."""
+    """Return the lamp, in the frame of the table if there is one, and notes on what is unknown about it."""
     surfels, found = [models.surfels(each.name, FINE_ACROSS) for each in step.found], step.found
     if step.table is None and not photos[0].on_table:
         light = _found_light(photo_light(photos[0], found, surfels))
-        return light, ["How far away the lamp is, cannot be told without a known table."]
+        return light, ["The distance of the lamp cannot be determined without a known table."]
     covered: tuple[float, float] | None = PAGE_M
     if step.table is not None:
         place, covered = step.table.T_world_camera, None
@@ -79,7 +77,7 @@ def _light(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels) -
     if fit.is_diffuse:
         return light, []
     if not fit.distance_known:
-        return light, ["How far away the lamp is, cannot be told: a distant one would look the same."]
+        return light, ["The distance of the lamp is unknown, because a distant lamp would look the same."]
     far = {"distance_m": float(fit.distance), "distance_std_m": float(fit.distance * fit.log_distance_std)}
     return light.model_copy(update=far), []
 
@@ -118,13 +116,13 @@ class Located:
     """A photograph with what is known of its camera.
 
     Attributes:
-        raw: free of distortion.
+        raw: photo without lens distortion.
         intrinsics: K of `raw` [px].
-        lens: that was found.
-        source: of the focal length.
+        lens: the lens that was found.
+        source: source of the focal length.
         T_world_camera: pose over the board; None if there is none.
         notes: sentences for the user about photo and camera.
-        missing: why no board was found; "" where one was.
+        missing: why no board was found; "" if one was.
     """
 
     raw: RawPhotograph
@@ -136,7 +134,7 @@ class Located:
     missing: str = ""
 
     def straightened(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-        """Straighten a mask of the photograph as it was read."""
+        """Return a mask of the original photo without lens distortion."""
         return self.lens.straightened(mask.astype(np.float32)) > 0.5
 
 
@@ -145,7 +143,7 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
 
     Args:
         raw: the decoded photo.
-        focal_px: focal length in pixels of the photo as it was sent; None where nobody knows.
+        focal_px: focal length in pixels of the photo as it was sent; None if it is unknown.
 
     Raises:
         InvalidInput: if the focal length makes no sense, or the board contradicts it.
@@ -160,7 +158,7 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
     if focal_px is not None and raw.focal_px is not None:
         written = raw.focal_px / scale
         if not 1 / _MOST_APART < focal_px / written < _MOST_APART:
-            notes.append(f"The focal length {focal_px:g} is not what the camera wrote into the photo, {written:.0f}.")
+            notes.append(f"The focal length {focal_px:g} differs from the one in the photo's EXIF data, {written:.0f}.")
     try:
         view, lens, source = _over_board(raw, given, notes)
     except InvalidInput as error:
@@ -171,7 +169,7 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
             K, note = guessed_intrinsics(raw)
             notes.append(note)
             source = _guess_source(raw)
-        notes.append("No printed board was found, so that the table is found from how objects stand on it.")
+        notes.append("No printed board was found; the table is found from how the objects stand on it.")
         notes.append(f"If a board is in view: {error}")
         return Located(raw, K, Lens(K, 0.0), source, None, tuple(notes), str(error))
     if lens.radial:
@@ -182,11 +180,11 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
 
 
 def locate_calibrated(raw: RawPhotograph, camera: KnownCamera) -> Located:
-    """Place the photograph of a calibrated camera: it stands where the calibration says, else over a board in view.
+    """Return the pose of a calibrated camera: from the calibration, or else from a board in view.
 
     Args:
         raw: the decoded photo.
-        camera: that took it.
+        camera: the calibrated camera.
 
     Raises:
         InvalidInput: if the photo has another shape than those that the camera was calibrated with.
@@ -200,12 +198,12 @@ def locate_calibrated(raw: RawPhotograph, camera: KnownCamera) -> Located:
             pose = locate_board(straight.eight_bit, Board(), lens.intrinsics).T_world_camera
         except InvalidInput as error:
             missing = str(error)
-            notes.append(f"The calibration does not say where the camera stands, and no board was found. {error}")
+            notes.append(f"The calibration does not hold the camera's pose, and no board was found. {error}")
     return Located(straight, lens.intrinsics, lens, "given", pose, tuple(notes), missing)
 
 
 def _over_board(raw: RawPhotograph, given: Intrinsics | None, notes: list[str]) -> tuple[BoardView, Lens, FocalSource]:
-    """Find camera, lens and source of the focal length; one that the board leaves open is guessed, and noted."""
+    """Return camera, lens and source of the focal length. A focal length that the board does not show is guessed."""
     try:
         return *locate_board_through_lens(raw.eight_bit, Board(), given), "board" if given is None else "given"
     except InvalidInput as error:
@@ -213,7 +211,7 @@ def _over_board(raw: RawPhotograph, given: Intrinsics | None, notes: list[str]) 
             raise
         guess, note = guessed_intrinsics(raw)
         found = locate_board_through_lens(raw.eight_bit, Board(), guess)
-        notes.append(f"The board is seen so that it does not show the focal length. {note}")
+        notes.append(f"From this angle the board does not show the focal length. {note}")
         return *found, _guess_source(raw)
 
 

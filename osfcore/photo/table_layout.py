@@ -1,4 +1,4 @@
-"""Where a photographed layout lies on our own table: seen from the goal camera's side, its middle in the middle."""
+"""Placement of a photographed layout on the simulated table: centred, and seen from the goal camera's side."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ class NoPhotographedTable(OsfError):
 
     def __init__(self) -> None:
         super().__init__(
-            "The photo does not tell where the table is: fewer than two of the marked objects stand on one plane. Mark "
-            "another one that stands on it, mend their outlines, or photograph it with the printed board in view."
+            "The table could not be found in the photo: fewer than two of the marked objects stand on one plane. Mark "
+            "another object on the table, correct the outlines, or take a photo with the printed board in view."
         )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TableLayout:
-    """What was found in a photograph, on our table.
+    """The contents of a photograph, placed on the simulated table.
 
     Attributes:
-        poses: of the objects, by name.
-        T_table_photo: where the photograph's table frame lies.
+        poses: poses of the objects, by name.
+        T_table_photo: pose of the photograph's table frame on the simulated table.
         T_table_camera: pose of the camera.
-        light: the lamp; overhead where nothing speaks for one.
+        light: the lamp; overhead if the photo shows no single lamp.
     """
 
     poses: Mapping[str, Pose]
@@ -50,13 +50,13 @@ def layout_of(
     """Move objects, camera and lamp of a photograph onto our table.
 
     Args:
-        found: in the photograph.
-        choices: which of an object's poses is taken, by name; the best otherwise.
-        T_table_photo: where the photograph's table lies; None to put the objects in the middle.
+        found: the contents of the photograph.
+        choices: index of the pose to use, by name of the object; the best pose otherwise.
+        T_table_photo: pose of the photograph's table frame; None to put the objects in the middle.
 
     Raises:
-        NoPhotographedTable: if it is not known where the photograph's table is.
-        InvalidInput: if an object lies where the pusher does not reach.
+        NoPhotographedTable: if the photograph's table is not known.
+        InvalidInput: if an object lies outside the reach of the pusher.
     """
     if found.table is None:
         raise NoPhotographedTable
@@ -72,7 +72,7 @@ def layout_of(
 
 
 def _light(found: FoundLight | None, T_table_photo: Pose) -> Light:
-    """Return the lamp on our table, never below the least height; overhead where nothing speaks for one."""
+    """Return the lamp on the simulated table, not below its least elevation; overhead if there is no single lamp."""
     if found is None or found.diffuse:
         return Light(np.array([0.0, 0.0, 1.0]))
     x, y, z = rotate(T_table_photo.quaternion, np.array(found.direction))

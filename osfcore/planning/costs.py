@@ -27,20 +27,21 @@ _SAME = 5  # decimals of metres and quaternions up to which states count as one
 
 
 class ImageCost:
-    """S = sum over t of |I(t) - I_goal|^2 with I(t) rendered from the goal camera, as a mean over pixels.
+    """Squared difference between rendered futures and the goal image: S = sum over t of |I(t) - I_goal|^2.
 
-    Deviations: futures are rendered in 64 pixels a side, at every third state and the last; states that are the same in
-    several sequences, as the beginnings mostly are, once. The pusher is left out, for the goal image shows none.
+    |.|^2 is the mean over pixels, and I(t) is rendered from the goal camera. Deviations from the paper: images have 64
+    pixels a side, and only every third state and the last one are rendered. A state that several sequences share is
+    rendered once. The pusher is left out, because the goal image shows none.
 
     Args:
-        renderer: of the objects on the table.
-        camera: of the goal image.
-        image: that camera's, linear RGB.
-        light: under which futures are rendered: that of the goal image.
+        renderer: renderer of the objects on the table.
+        camera: camera of the goal image.
+        image: goal image, linear RGB in [0, 1].
+        light: light of the goal image, under which futures are rendered.
         every: actions between rendered states; 1 for the paper's sum over all of them.
 
     Raises:
-        InvalidInput: if the image has another size than its camera's.
+        InvalidInput: if the image has another size than its camera.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class ImageCost:
         self._image = cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA)
 
     def __call__(self, rollouts: Rollouts) -> Float[np.ndarray, "K"]:
-        """The cost of each sequence."""
+        """Return the cost of each sequence."""
         horizon = rollouts.positions.shape[1] - 1
         times = np.arange(horizon, 0, -self._every)
         states = np.concatenate([rollouts.positions[:, times], rollouts.quaternions[:, times]], axis=-1)
@@ -65,7 +66,7 @@ class ImageCost:
         return horizon * costs.reshape(states.shape[:2]).mean(axis=1)
 
     def _costs(self, names: tuple[str, ...], states: Float[np.ndarray, "B N 7"]) -> Float[np.ndarray, "B"]:
-        """Mean squared differences of single states."""
+        """Return the mean squared differences of single states."""
         quaternions = states[..., 3:] / np.linalg.norm(states[..., 3:], axis=-1, keepdims=True)
         lights = np.tile(self._light.direction, (len(states), 1))
         batch = SceneBatch(names, states[..., :3], quaternions, lights, None)
@@ -81,20 +82,26 @@ TERMINAL_WEIGHT = 2.0  # of the last state, against the mean over the horizon
 
 
 class Cost(Protocol):
-    """A cost of futures."""
+    """A cost of futures: any function from `Rollouts` to one number for each."""
 
     def __call__(self, rollouts: Rollouts) -> Float[np.ndarray, "K"]:
-        """The cost of each sequence; less is better."""
+        """Return the cost of each of the K futures; lower is better."""
         ...
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseGoal:
-    """Where each object should be.
+    """The pose that each object should reach.
 
     Attributes:
-        names: of the N objects.
-        poses: theirs.
+        names: names of the N objects.
+        poses: their goals `T_world_object`, a batch of N.
+
+    Example:
+        >>> there = Pose(np.array([0.08, 0.0, 0.095]), upright.quaternion)
+        >>> goal = PoseGoal.of(state, {name: there})
+        >>> goal.offsets_m(state)
+        array([[0.08, 0.  ]])
     """
 
     names: tuple[str, ...]
@@ -102,7 +109,11 @@ class PoseGoal:
 
     @staticmethod
     def of(state: SceneState, moved: Mapping[str, Pose]) -> PoseGoal:
-        """Some objects elsewhere, the others where they are.
+        """Return a goal that moves some objects and leaves the others where they are.
+
+        Args:
+            state: state of the scene.
+            moved: goals `T_world_object` of the objects that should move, by name.
 
         Raises:
             InvalidInput: if an object is not in the scene.
@@ -113,51 +124,57 @@ class PoseGoal:
         return PoseGoal(state.names, state.poses).replaced(moved)
 
     def pose(self, name: str) -> Pose:
-        """Where one object should be."""
+        """Return the goal `T_world_object` of one object."""
         return self.poses[self.names.index(name)]
 
     def replaced(self, poses: Mapping[str, Pose]) -> PoseGoal:
-        """The goal with some objects elsewhere."""
+        """Return the goal with other poses for some objects."""
         every = [poses.get(name) or self.pose(name) for name in self.names]
         positions, quaternions = ([getattr(pose, part) for pose in every] for part in ("position", "quaternion"))
         return PoseGoal(self.names, Pose(np.array(positions), np.array(quaternions)))
 
     def poses_of(self, names: tuple[str, ...]) -> Pose:
-        """The poses of objects in another order."""
+        """Return the goal poses of objects in this order."""
         return self.poses[[self.names.index(name) for name in names]]
 
     def offsets_m(self, state: SceneState) -> Float[np.ndarray, "N 2"]:
-        """Return how far each object has to go, horizontally, in the order of the state [m]."""
+        """Return the x and y distance from each object to its goal [m], in the order of the state."""
         return self.poses_of(state.names).position[:, :2] - state.poses.position[:, :2]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseCost:
-    """Distance of poses: `S = mean_t c(t) + 2 c(T)`, `c(t) = sum_n |p_n(t) - p_n*| + arm * angle(q_n(t), q_n*)` [m].
+    """Distance of futures from goal poses: the mean over the horizon plus twice the distance at its end [m].
 
-    Positions p are compared horizontally.
+    `S = mean_t c(t) + 2 c(T)` with `c(t) = sum_n |p_n(t) - p_n*| + arm * angle(q_n(t), q_n*)`. Positions p are compared
+    in x and y only.
 
     Attributes:
-        goal: where that is.
-        arm_m: what a rotation counts [m/rad]; 0 to leave rotations out.
+        goal: the goal poses.
+        arm_m: weight of rotations [m/rad]; 0 to ignore them.
+
+    Example:
+        >>> waiting = push_model.rollout(state, np.zeros((1, 5, 3)))
+        >>> PoseCost(goal)(waiting).round(3)  # 3 x 0.08 m
+        array([0.24])
     """
 
     goal: PoseGoal
     arm_m: float = ARM_M
 
     def __call__(self, rollouts: Rollouts) -> Float[np.ndarray, "K"]:
-        """Running cost averaged over the horizon, plus the weighted terminal cost."""
+        """Return the cost of each future [m]."""
         running_cost = object_costs(rollouts, self.goal, self.arm_m)[:, 1:].sum(axis=2)
         return running_cost.mean(axis=1) + TERMINAL_WEIGHT * running_cost[:, -1]
 
 
 def object_costs(rollouts: Rollouts, goal: PoseGoal, arm_m: float = ARM_M) -> Float[np.ndarray, "K T1 N"]:
-    """|p_n(t) - p_n*| + arm * angle(q_n(t), q_n*) of each object, before the first and after each action [m].
+    """Return |p_n(t) - p_n*| + arm * angle(q_n(t), q_n*) of each object, before the first and after each action [m].
 
     Args:
         rollouts: the futures.
-        goal: where everything should be.
-        arm_m: what a rotation counts [m/rad]; 0 to leave rotations out.
+        goal: the goal poses.
+        arm_m: weight of rotations [m/rad]; 0 to ignore them.
     """
     order = [goal.names.index(name) for name in rollouts.names]
     cost = np.linalg.norm(rollouts.positions[..., :2] - goal.poses.position[order, :2], axis=-1)

@@ -6,15 +6,20 @@ K sequences of T actions, a_k, are sampled, rolled out and scored, S_k = cost(ro
 
 and the next plan is warm-started from it, shifted by the actions that were executed.
 
-Deviations: samples are not drawn around the nominal sequence alone but from three sources (the nominal sequence, push
-proposals, random walks), what succeeded in them is recombined, and the average is taken in a second round of samples
-around the best of the first: the mean of a path around the left and one around the right of an object leads into it.
-The second round has a shorter horizon, since later actions are planned again before they are executed; only every third
-plan has a first round, and those that only walk no second one. The average, or the best sample, replaces the plan so
-far if it costs less over the whole horizon. Where few sequences are compared, their cost is the mean over begins of the
-pusher a few millimetres apart, for a push that slips off an object when it begins elsewhere will slip off. lambda is
-relative to the spread of the costs, temperature * (median S - min S). Noise is added to the pusher's path at knots, not
-to its velocity, so that its variance does not grow along the horizon.
+Deviations from the paper:
+
+- Samples come from three sources: perturbations of the nominal sequence, push proposals, and random walks. Successful
+  pushes of different samples are then recombined.
+- The average is taken over a second round of samples, around the best of the first. Over the first round it would fail:
+  the mean of a path around the left and one around the right of an object leads into the object.
+- The second round has a shorter horizon, since later actions are planned again before they are executed. Only every
+  third plan has a first round. Plans in which the pusher only walks for now have no second round.
+- The average, or the best sample, replaces the plan so far if it costs less over the whole horizon.
+- The cost of the finalists is the mean over starts of the pusher a few millimetres apart. A push that slips off the
+  object from one of these starts is likely to slip off in the world as well.
+- lambda is relative to the spread of the costs, temperature * (median S - min S).
+- Noise is added at knots of the pusher's path and not to its velocity, so that its variance does not grow along the
+  horizon.
 """
 
 from __future__ import annotations
@@ -44,47 +49,51 @@ Rollout = Callable[[SceneState, Float[np.ndarray, "K T 3"], SceneState | None], 
 
 
 class PushSource(Protocol):
-    """Proposes push sequences. A protocol, because the page draws plans where torch is not loaded."""
+    """Proposes sequences of pushes. It is a protocol, so that the page can draw plans without loading torch."""
 
     def draw(
         self, state: SceneState, goal: PoseGoal, count: int, horizon: int, rng: np.random.Generator
     ) -> Float[np.ndarray, "P T 3"]:
-        """Sequences of actions [m/s].
+        """Return sequences of actions [m/s].
 
         Args:
-            state: of the scene, with its pusher.
-            goal: where everything should be.
-            count: how many are wanted; fewer may come back, and none where nothing needs a push.
+            state: state of the scene, with a pusher.
+            goal: the goal poses.
+            count: number of sequences wanted. Fewer may come back, and none if nothing needs a push.
             horizon: actions in each sequence (T).
-            rng: draws them.
+            rng: random generator.
         """
         ...
 
     def recombine(self, goal: PoseGoal, rollouts: Rollouts, count: int) -> Float[np.ndarray, "P T 3"]:
-        """At most `count` sequences made of what succeeded in different futures; perhaps none.
+        """Return at most `count` sequences that combine successful pushes of different futures.
 
         Args:
-            goal: where everything should be.
-            rollouts: the futures, from one state.
-            count: of sequences.
+            goal: the goal poses.
+            rollouts: futures that begin in one state.
+            count: largest number of sequences.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """How pushes are planned.
+    """Settings of `MPPIPlanner`.
 
     Attributes:
-        samples: sequences of actions in each of both rounds (K).
-        horizon: actions in each (T).
-        temperature: of the softmax, as a share of the spread of costs in the better half of the second round.
-        noise_m: sigma of the pusher's path around the plan [m].
-        knot_every: actions between the places where the noise is drawn, with straight lines between them.
-        refined: actions that the second round looks at and changes.
-        proposals_every: plans of which one has a first round; the others refine the nominal sequence alone.
-        recombined: sequences that are made of what succeeded in those of the first round.
-        begins_m: how far apart the pusher's begins are over which costs are averaged [m]; 0 to trust in rollouts.
+        samples: sequences of actions in each of the two rounds (K).
+        horizon: actions in each sequence (T).
+        temperature: temperature of the softmax, as a share of the difference between median and least cost in the
+            second round.
+        noise_m: standard deviation of the pusher's path around the plan [m].
+        knot_every: actions from one knot of the noise to the next. Between knots the noise is linear.
+        refined: actions at the beginning of the plan that the second round changes.
+        proposals_every: plans of which one has a first round. The others refine the nominal sequence alone.
+        recombined: sequences that combine successful pushes of the first round; 0 for none.
+        begins_m: offset of the pusher's start in the rollouts over which costs are averaged [m]; 0 for no averaging.
+
+    Raises:
+        InvalidInput: if a value is out of range.
     """
 
     samples: int = 160
@@ -98,11 +107,7 @@ class PlanSettings:
     begins_m: float = 0.003
 
     def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            InvalidInput: naming what is out of range.
-        """
+        """Check the ranges."""
         check_ranges(
             ("number of samples", self.samples, 8, MAX_SEQUENCES),
             ("horizon [actions]", self.horizon, 1, MAX_HORIZON),
@@ -121,12 +126,11 @@ class PlanRound:
     """One round of a plan.
 
     Attributes:
-        number: of the round, from 0.
-        actions: the plan so far [m/s]: the best sequence of the first round; in the second its first actions are the
-            softmax average.
-        rollouts: all futures of the round; those of the second are shorter.
-        costs: theirs.
-        chosen: number of the sequence that was chosen; by default the one that costs least.
+        number: 0 for the first round, which samples whole plans; 1 for the second, which refines the best one.
+        actions: the plan so far [m/s]. After the second round, its first actions may be the softmax average.
+        rollouts: all futures of the round. Those of the second round are shorter.
+        costs: costs of the futures.
+        chosen: index of the chosen sequence; None for the one with the least cost.
     """
 
     number: int
@@ -137,19 +141,19 @@ class PlanRound:
 
     @property
     def best(self) -> Rollouts:
-        """The future of the chosen sequence, K = 1; the plan's own lies close to it."""
+        """The future of the chosen sequence, with K = 1. The future of the plan itself is close to it."""
         return self.rollouts[int(self.costs.argmin()) if self.chosen is None else self.chosen]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlanSketch:
-    """A round of planning, as much of it as a picture shows.
+    """The part of a planning round that a picture shows.
 
     Attributes:
         step: actions executed so far.
-        ways: where the pusher would go, cheapest first [m].
-        costs: theirs, ascending.
-        best: the cheapest future, K = 1.
+        ways: paths of the pusher in the world [m], in order of their costs.
+        costs: costs of the paths, ascending.
+        best: the future with the least cost, with K = 1.
     """
 
     step: int
@@ -159,7 +163,7 @@ class PlanSketch:
 
 
 def sketch_of(step: int, round_: PlanRound) -> PlanSketch:
-    """Return the best future, and ways spread evenly from the cheapest to the dearest."""
+    """Return the best future, and paths spread evenly over all ranks of cost."""
     order = np.argsort(round_.costs, kind="stable")
     chosen = order[np.round(np.linspace(0, len(order) - 1, min(WAYS, len(order)))).astype(int)]
     ways = round_.rollouts.pusher[chosen, :, :2].astype(np.float32)
@@ -167,12 +171,28 @@ def sketch_of(step: int, round_: PlanRound) -> PlanSketch:
 
 
 class MPPIPlanner:
-    """Receding-horizon planner: each plan is warm-started from the last one.
+    """A receding-horizon planner (MPPI) that starts each plan from the last one.
+
+    Its plan is the "nominal sequence" of actions. `plan` improves it, `nominal` returns its next actions, and `shift`
+    drops those that were executed.
 
     Args:
-        rollout: predicts futures: state, actions, and the state one action ago if known.
-        proposals: samples pushes that are likely to be useful.
-        settings: of the plan.
+        rollout: function that predicts futures from a state, actions, and the state one action earlier or None.
+        proposals: source of pushes that are likely to be useful.
+        settings: settings of the plan.
+
+    Example:
+        >>> from osfcore.planning.mppi import PlanSettings
+        >>> planner = MPPIPlanner(
+        ...     push_model.rollout,
+        ...     PushProposals(load_shapes(None, fields, [name])),
+        ...     PlanSettings(samples=32, horizon=10),
+        ... )
+        >>> first, second = planner.plan(state, goal, PoseCost(goal), np.random.default_rng(0))
+        >>> bool(first.costs.min() < 0.24)  # less than doing nothing
+        True
+        >>> planner.nominal(3).shape  # the next three actions [m/s]
+        (3, 3)
     """
 
     def __init__(self, rollout: Rollout, proposals: PushSource, settings: PlanSettings | None = None) -> None:
@@ -183,16 +203,16 @@ class MPPIPlanner:
         self._known: PlanRound | None = None  # the nominal sequence's own future, the last time it was rolled out
 
     def reset(self) -> None:
-        """Drop the nominal sequence: the goal or the scene is another one."""
+        """Forget the nominal sequence, because the goal or the scene has changed."""
         self._nominal = self._known = None
 
     def nominal(self, count: int) -> Float[np.ndarray, "count 3"]:
-        """The next actions of the nominal sequence; zero after its end, and without a plan [m/s]."""
+        """Return the next actions of the nominal sequence [m/s]; zeros after its end, or without a plan."""
         plan = np.zeros((0, 3)) if self._nominal is None else self._nominal[:count]
         return np.concatenate([plan, np.zeros((count - len(plan), 3))])
 
     def shift(self, count: int) -> None:
-        """Shift the nominal sequence by actions that have been executed, to warm-start the next plan."""
+        """Drop executed actions from the beginning of the nominal sequence, from which the next plan starts."""
         if self._known is not None:
             self._known = replace(self._known, rollouts=self._known.rollouts.after(count))
         if self._nominal is not None:
@@ -201,20 +221,21 @@ class MPPIPlanner:
     def plan(
         self, state: SceneState, goal: PoseGoal, cost: Cost, rng: np.random.Generator, before: SceneState | None = None
     ) -> Iterator[PlanRound]:
-        """Plan in two rounds, in the second one alone, or not at all where the plan goes on walking.
+        """Plan in up to two rounds.
 
-        What was proposed a moment ago is still worth following, so that proposals are drawn in every third plan, and
-        whenever the nominal sequence has ended. It is refined once it will soon touch something.
+        The first round samples new sequences. It runs in every third plan (`proposals_every`), and whenever the nominal
+        sequence has ended. The second round refines the nominal sequence. It is skipped while the pusher still walks
+        without touching anything soon.
 
         Args:
-            state: of the scene, with its pusher.
-            goal: of the push proposals.
-            cost: of rollouts.
-            rng: draws all samples.
-            before: the same objects one action ago, for their velocities.
+            state: state of the scene, with a pusher.
+            goal: goal poses, toward which pushes are proposed.
+            cost: cost of futures, which the plan minimises.
+            rng: random generator of all samples.
+            before: state of the same objects one action earlier, which gives their velocities; at rest if None.
 
         Yields:
-            The rounds.
+            Each round after it was computed.
 
         Raises:
             InvalidInput: if the state has no pusher.
@@ -245,7 +266,7 @@ class MPPIPlanner:
         yield replace(round_, actions=whole.actions)
 
     def _follow(self, round_: PlanRound) -> None:
-        """Take the chosen sequence of a round for the nominal one."""
+        """Make the chosen sequence of a round the nominal one."""
         assert round_.chosen is not None
         self._nominal = round_.actions
         self._known = replace(round_, rollouts=round_.best, costs=round_.costs[[round_.chosen]], chosen=None)
@@ -268,7 +289,7 @@ class MPPIPlanner:
         self, round_: PlanRound, actions: Float[np.ndarray, "K T 3"], state: SceneState, cost: Cost,
         before: SceneState | None,
     ) -> PlanRound:  # fmt: skip
-        """A round with the sequence for its plan that costs least on average over begins of the pusher."""
+        """Return the round with the sequence as its plan that costs least on average over starts of the pusher."""
         finalists = np.argsort(round_.costs, kind="stable")[: _FINALISTS if self.settings.begins_m else 1]
         total = round_.costs[finalists]
         if len(finalists) > 1:
@@ -289,7 +310,7 @@ class MPPIPlanner:
     def _sample_first_round(
         self, state: SceneState, goal: PoseGoal, rng: np.random.Generator
     ) -> Float[np.ndarray, "K T 3"]:
-        """The nominal sequence and perturbations of it, random walks, and push proposals."""
+        """Return the nominal sequence and perturbations of it, random walks, and push proposals."""
         settings = self.settings
         nominal, share = self.nominal(settings.horizon), settings.samples // 8
         walks = self._perturbed(np.zeros_like(nominal), share, rng, _RANDOM_WALK_M)
@@ -308,14 +329,14 @@ class MPPIPlanner:
         *,
         keep_end: bool = False,
     ) -> Float[np.ndarray, "K T 3"]:
-        """A sequence, and perturbations of its path by noise that is linear between knots.
+        """Perturb the path of a sequence by noise that is linear between knots.
 
         Args:
-            plan: the sequence.
-            count: of all sequences.
-            rng: draws the noise.
-            noise_m: its standard deviation at the knots [m].
-            keep_end: no noise at the end of the path.
+            plan: the sequence [m/s].
+            count: number of sequences to return.
+            rng: random generator of the noise.
+            noise_m: standard deviation of the noise at the knots [m].
+            keep_end: whether the end of the path stays the same.
 
         Returns:
             `count` sequences; the first is the plan itself.
@@ -336,20 +357,20 @@ class MPPIPlanner:
 
 
 def _hurried(plan: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 3"]:
-    """The same path as fast as the pusher can, for the average of sequences that hesitate somewhere hesitates."""
+    """Return the same path at full speed. The average of many sequences would pause wherever one of them does."""
     path = STEP_S * np.pad(np.cumsum(plan[:, :2], axis=0), ((1, 0), (0, 0)))
     return actions_along(path, len(plan))
 
 
 def _walks(future: Rollouts) -> int:
-    """Actions before the first that moves something; 0 if none does."""
+    """Return the number of actions before the first that moves something; 0 if none does."""
     shift = np.linalg.norm(future.positions[0] - future.positions[0, :1], axis=-1).max(axis=-1, initial=0.0)
     moving = np.flatnonzero(shift > _TOUCHED_M)
     return int(moving[0]) - 1 if len(moving) else 0
 
 
 def _mppi_weights(costs: Float[np.ndarray, "K"], temperature: float) -> Float[np.ndarray, "K"]:
-    """The softmax weights w_k, with lambda = temperature * (median S - min S)."""
+    """Return the softmax weights w_k, with lambda = temperature * (median S - min S)."""
     spread = max(float(np.median(costs) - costs.min()), 1e-9)
     weights = np.exp(-(costs - costs.min()) / (temperature * spread))
     return weights / weights.sum()

@@ -1,4 +1,4 @@
-"""Costs and planners by name, and what each is made from; other packages offer more (`osfcore.plugins`)."""
+"""Costs and planners by name, and the inputs of their factories. Other packages can add more (`osfcore.plugins`)."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from osfcore.render.types import Renderer
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CostInputs:
-    """Inputs of a cost: what it may compare futures with, and a renderer to draw them.
+    """Inputs of a factory of costs.
 
     Attributes:
-        goal: where everything should be.
-        camera: of the goal image.
-        image: that camera's, linear RGB.
-        light: of the goal image.
-        renderer: of the objects on the table.
+        goal: the goal poses.
+        camera: camera of the goal image.
+        image: goal image, linear RGB in [0, 1].
+        light: light of the goal image.
+        renderer: renderer of the objects on the table, to draw futures with.
     """
 
     goal: PoseGoal
@@ -39,12 +39,12 @@ class CostInputs:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlannerInputs:
-    """Inputs of a planner.
+    """Inputs of a factory of planners.
 
     Attributes:
-        rollout: predicts futures: state, actions, and the state one action ago if known.
-        proposals: samples pushes that are likely to be useful.
-        settings: of the plan.
+        rollout: function that predicts futures from a state, actions, and the state one action earlier or None.
+        proposals: source of pushes that are likely to be useful.
+        settings: settings of the plan.
     """
 
     rollout: Rollout
@@ -53,10 +53,11 @@ class PlannerInputs:
 
 
 class Planner(Protocol):
-    """A planner of actions: `MPPIPlanner` says what each method does.
+    """A planner of actions. `MPPIPlanner` describes each method in full.
 
     Attributes:
-        settings: replaced while an episode runs; the horizon shrinks to the actions that are left.
+        settings: settings of the plan. An episode replaces them while it runs: the horizon shrinks to the actions that
+            are left.
     """
 
     settings: PlanSettings
@@ -64,19 +65,19 @@ class Planner(Protocol):
     def plan(
         self, state: SceneState, goal: PoseGoal, cost: Cost, rng: np.random.Generator, before: SceneState | None = None
     ) -> Iterator[PlanRound]:
-        """Plan anew; one round or more."""
+        """Yield one or more rounds of a new plan."""
         ...
 
     def nominal(self, count: int) -> Float[np.ndarray, "count 3"]:
-        """The next actions of the plan; zero after its end, and without one [m/s]."""
+        """Return the next actions of the plan [m/s]; zeros after its end, or without a plan."""
         ...
 
     def shift(self, count: int) -> None:
-        """Go on by actions that have been executed."""
+        """Drop actions that have been executed from the beginning of the plan."""
         ...
 
     def reset(self) -> None:
-        """Drop the plan: the goal or the scene is another one."""
+        """Forget the plan, because the goal or the scene has changed."""
         ...
 
 
@@ -85,7 +86,7 @@ PLANNER = PartKind("planner", ("plan", "nominal", "shift", "reset"))
 
 
 def mppi(given: PlannerInputs) -> Planner:
-    """Make our planner."""
+    """Return the default planner."""
     return MPPIPlanner(given.rollout, given.proposals, given.settings)
 
 

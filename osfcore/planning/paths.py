@@ -1,8 +1,8 @@
-"""Path planning of the pusher: shortest collision-free paths on a grid, shortcut by line of sight.
+"""Path planning of the pusher: shortest collision-free paths on a grid, shortened by lines of sight.
 
 The configuration space is the distance transform of the objects' outlines; paths are minimum-cost paths over its cells
-(scikit-image's MCP_Geometric, a Dijkstra search). Cells too close to an object cost 200 times as much, so that a start
-in contact is possible and, where no path is free, the one with the fewest such cells is found.
+(scikit-image's MCP_Geometric, a Dijkstra search). Cells too close to an object cost 200 times as much. A path can then
+start in contact. If no path is free, the result is the one with the fewest such cells.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ _BLOCKED = 200.0  # cost of a cell too close to something, for a start in contac
 
 
 class FreeSpace:
-    """Where the centre of a disc, usually the pusher, can be without touching anything.
+    """Free space of the centre of a disc, usually the pusher.
 
     Attributes:
-        clearance: between the disc's rim and the nearest outline, for its centre on each cell of the grid [m].
+        clearance: distance from the disc's rim to the nearest outline, with its centre on each cell of the grid [m].
     """
 
     clearance: Float[np.ndarray, "S S"]
 
     def __init__(self, outlines: Sequence[Float[np.ndarray, "_ 2"]], radius: float = PUSHER_RADIUS_M) -> None:
-        """Draw the objects.
+        """Compute the clearance from the outlines of the objects.
 
         Args:
-            outlines: of their convex parts, seen from above [m].
-            radius: of the disc [m].
+            outlines: outlines of their convex parts, seen from above [m].
+            radius: radius of the disc [m].
         """
         solid = np.zeros((_SIDE, _SIDE), np.uint8)
         for outline in outlines:
@@ -51,18 +51,18 @@ class FreeSpace:
         self._free = self.clearance >= CLEARANCE_M
 
     def is_free(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-        """Decide whether the disc clears everything at some places within the pusher's reach."""
+        """Return whether the disc is clear of all objects at places within the pusher's reach."""
         return self.clearance_at(points) >= CLEARANCE_M
 
     def clearance_at(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Return the clearance at some places [m]; minus infinity beyond the pusher's reach."""
+        """Return the clearance at places [m]; minus infinity beyond the pusher's reach."""
         cells = _cells(points)
         within = np.all((cells >= 0) & (cells < _SIDE), axis=1)
         rows = cells.clip(0, _SIDE - 1)
         return np.where(within, self.clearance[rows[:, 0], rows[:, 1]], -np.inf)
 
     def paths_from(self, start: Float[np.ndarray, "2"]) -> ShortestPaths:
-        """All shortest paths from a place within reach [m]."""
+        """Return all shortest paths from a place within reach [m]."""
         return ShortestPaths(self._free, start)
 
 
@@ -70,8 +70,8 @@ class ShortestPaths:
     """Shortest paths from one place.
 
     Args:
-        free: cells that they should lead through.
-        start: where they begin [m].
+        free: cells that the paths should use.
+        start: their start [m].
     """
 
     def __init__(self, free: Bool[np.ndarray, "S S"], start: Float[np.ndarray, "2"]) -> None:
@@ -82,13 +82,13 @@ class ShortestPaths:
         self._search.find_costs(_cells(start[None]).clip(0, _SIDE - 1).tolist())
 
     def to(self, end: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
-        """The path to a place within reach, as its corners [m]."""
+        """Return the corners of the path to a place within reach [m]."""
         cells = np.array(self._search.traceback(_cells(end[None]).clip(0, _SIDE - 1)[0].tolist()))
         corners = cells[self._corners(cells)] * CELL_M - PUSHER_REACH_M
         return np.concatenate([self._start[None], corners[1:-1], end[None]])
 
     def _corners(self, cells: Int[np.ndarray, "n 2"]) -> list[int]:
-        """Shortcut smoothing: each corner is followed by the farthest one with a free line between them."""
+        """Shorten a path: connect each corner to the farthest corner with a free line between them."""
         kept, at = [0], 0
         while at < len(cells) - 1:
             later = len(cells) - 1
@@ -109,13 +109,13 @@ def _cells(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
 def actions_along(
     path: Float[np.ndarray, "n 2"], horizon: int, speeds: Float[np.ndarray, "n-1"] | None = None
 ) -> Float[np.ndarray, "T 3"]:
-    """Velocities that follow a path, each leg at its share of the highest speed; zero after its end [m/s].
+    """Return velocities that follow a path [m/s], each leg at its share of the highest speed; zeros after its end.
 
-    The pusher goes straight during an action. Where that would pass a corner by more than 12 mm, the action ends at the
-    corner, so that ways around objects hardly touch them and pushes begin about where they should.
+    The pusher moves straight during an action. If it would miss a corner by more than 12 mm, the action ends at the
+    corner. Paths around objects then hardly touch them, and pushes begin close to their planned starts.
 
     Args:
-        path: corners, the first where the pusher is [m].
+        path: corners of the path; the first is the position of the pusher [m].
         horizon: number of actions.
         speeds: share of the highest speed on each leg, above 0; all 1 by default.
     """
@@ -129,7 +129,7 @@ def actions_along(
 
 
 def _next_moment(corners: list[list[float]], times: list[float], now: float, here: list[float]) -> float:
-    """Find when the action that begins now ends [actions of the path's time]: after a whole one, or at a corner."""
+    """Return the end of the action that begins now, in actions along the path: after a whole action or at a corner."""
     end = now + 1
     first, last = bisect_right(times, now), bisect_left(times, end)
     while last > first:
@@ -142,7 +142,7 @@ def _next_moment(corners: list[list[float]], times: list[float], now: float, her
 
 
 def _place_at(corners: list[list[float]], times: list[float], moment: float) -> list[float]:
-    """Return the place of the path at a moment; its last corner after its end."""
+    """Return the position on the path at a moment; its last corner after its end."""
     after = bisect_right(times, moment)
     if after == len(times):
         return corners[-1]
@@ -151,14 +151,14 @@ def _place_at(corners: list[list[float]], times: list[float], moment: float) -> 
 
 
 def _distance_to_line(point: list[float], begin: list[float], end: list[float]) -> float:
-    """Distance of a point from a line segment [m]."""
+    """Return the distance of a point from a line segment [m]."""
     x, y, u, v = end[0] - begin[0], end[1] - begin[1], point[0] - begin[0], point[1] - begin[1]
     share = min(max((u * x + v * y) / max(x * x + y * y, 1e-12), 0.0), 1.0)
     return math.hypot(u - share * x, v - share * y)
 
 
 def duration_s(path: Float[np.ndarray, "n 2"], speeds: Float[np.ndarray, "n-1"] | None = None) -> float:
-    """Duration of a path [s], each leg at its share of the highest speed; corners may take longer."""
+    """Return the duration of a path [s], each leg at its share of the highest speed. Corners may take longer."""
     return float(_legs_s(path, speeds).sum())
 
 

@@ -1,7 +1,7 @@
-"""Push proposals for MPPI: one object after another is pushed to its goal.
+"""Push proposals for MPPI: sequences that push one object after another to its goal.
 
-Straight pushes and what they do, sequences of up to three, the order of objects with detours for what is in the way,
-and recombination of pushes that succeeded in different futures.
+This file has the order of the objects with detours around others, tables of straight pushes and their effects,
+sequences of up to three pushes, and recombination of pushes that succeeded in different futures.
 """
 
 from __future__ import annotations
@@ -34,12 +34,14 @@ from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_RADIUS_M, PUSHER_RE
 from osfcore.planning.costs import ARM_M, TERMINAL_WEIGHT, PoseGoal, object_costs
 from osfcore.planning.paths import CELL_M, CLEARANCE_M, FreeSpace, ShortestPaths, actions_along, duration_s
 
-# In which order objects are pushed, and where to on the way: blocked goals, swaps and detours.
+# The order in which objects are pushed, and their intermediate goals: blocked goals, swaps and detours.
 #
-# An object whose goal is taken by another one waits until that one has left; of objects that wait for each other
-# one is first brought to a buffer, a free place near its way; and one whose straight way is barred is brought to
-# the corners of the shortest path around what bars it. (Buffers and dependency graphs are those of tabletop
-# rearrangement: Han et al., 2018; detours are paths of a disc as wide as the object.)
+# - An object whose goal is occupied waits until the other object has left.
+# - If objects wait for each other, one of them is first pushed to a buffer, a free place near its way.
+# - An object whose straight way is blocked is pushed to the corners of the shortest path around the obstacle.
+#
+# Buffers and dependency graphs are those of tabletop rearrangement (Han et al., 2018). Detours are paths of a disc as
+# wide as the object.
 
 
 _PERMUTATIONS = 720  # looked at; all of six objects
@@ -55,11 +57,11 @@ OutlinesAt = Callable[[int, Pose], Outlines]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stage:
-    """An object and where it is brought to.
+    """A goal or an intermediate goal of one object.
 
     Attributes:
-        number: of the object.
-        target: its pose then.
+        number: index of the object.
+        target: pose `T_world_object` to push it to.
     """
 
     number: int
@@ -74,15 +76,15 @@ def push_orders(
     count: int,
     rng: np.random.Generator,
 ) -> list[tuple[Stage, ...]]:
-    """Orders that bring all objects to their goals.
+    """Return orders of stages that bring all objects to their goals.
 
     Args:
-        now: where the objects are.
-        goals: where they should be.
-        off: numbers of those that are not there.
-        outlines: returns those of an object at a pose [m].
-        count: of orders at most.
-        rng: draws among possible ones.
+        now: present poses of the objects.
+        goals: goal poses of the objects.
+        off: indices of the objects that are not at their goals.
+        outlines: function that returns the outlines of an object at a pose [m].
+        count: largest number of orders.
+        rng: random generator, which draws among possible orders.
     """
     waits = _dependencies(now, goals, off, outlines)
     every = list(permutations(off)) if len(off) <= 6 else [tuple(rng.permutation(off)) for _ in range(_PERMUTATIONS)]
@@ -99,7 +101,7 @@ def push_orders(
 def _dependencies(
     now: Sequence[Pose], goals: Sequence[Pose], off: Sequence[int], outlines: OutlinesAt
 ) -> dict[int, frozenset[int]]:
-    """Return for each object those that take its goal and will leave it."""
+    """Return for each object the objects that occupy its goal and will leave it."""
     taken = {n: FreeSpace(outlines(n, now[n]), 0.0).clearance < CLEARANCE_M for n in off}
     wanted = {n: FreeSpace(outlines(n, goals[n]), 0.0).clearance <= 0 for n in off}
     return {n: frozenset(other for other in off if other != n and np.any(wanted[n] & taken[other])) for n in off}
@@ -118,7 +120,7 @@ def _with_buffers(
     now: Sequence[Pose], goals: Sequence[Pose], every: Sequence[tuple[int, ...]], waits: dict[int, frozenset[int]],
     outlines: OutlinesAt, count: int, rng: np.random.Generator,
 ) -> Iterator[tuple[Stage, ...]]:  # fmt: skip
-    """Yield orders that begin with one object's way to a buffer; without any such, a plain one."""
+    """Yield orders that begin by moving one object to a buffer, or one plain order if there is none."""
     found = 0
     for k in rng.permutation(len(every)):
         order = every[k]
@@ -134,7 +136,7 @@ def _with_buffers(
 
 
 def _buffer(n: int, now: Sequence[Pose], goals: Sequence[Pose], outlines: OutlinesAt) -> Pose | None:
-    """Find a free place for an object near its way, clear of all others where they are and where they will be."""
+    """Return a free place for an object near its way, clear of the present and goal poses of all others."""
     others = [part for k in range(len(now)) for pose in (now[k], goals[k]) if k != n for part in outlines(k, pose)]
     space = FreeSpace([*others, *outlines(n, goals[n])], 0.0)
     radius = np.linalg.norm(np.concatenate(outlines(n, now[n])) - now[n].position[:2], axis=1).max()
@@ -159,7 +161,7 @@ def _with_detours(order: Sequence[Stage], now: Sequence[Pose], outlines: Outline
 
 
 def _corners(n: int, places: Sequence[Pose], target: Pose, outlines: OutlinesAt) -> Float[np.ndarray, "C 2"]:
-    """Find where an object must turn on its way around others; nowhere if the straight way is clear."""
+    """Return the corners of an object's way around others; none if the straight way is clear."""
     others = [part for k in range(len(places)) if k != n for part in outlines(k, places[k])]
     begin, end = places[n].position[:2], target.position[:2]
     none = np.zeros((0, 2))
@@ -179,13 +181,11 @@ def _moved(pose: Pose, place: Float[np.ndarray, "2"]) -> Pose:
     return Pose(np.array([*place, pose.position[2]]), pose.quaternion)
 
 
-# What straight pushes do to one object: a table of pushes, from all around it, and of the motions that they lead
-# to.
+# The effect of straight pushes on one object: a table of pushes from all sides and of the resulting motions.
 #
-# The table is in a frame at the object's centre of mass that turns with its yaw, so that it serves wherever the
-# object lies and however it is turned about the vertical, as long as it rests on the same side. The learned
-# dynamics model fills it, for over 24 cm it errs by 3 to 5 deg in the median where the quasi-static limit surface
-# errs by 10 to 20 deg.
+# The table is in a frame at the object's centre of mass that turns with its yaw. It is valid for all positions and yaw
+# angles of the object, as long as the object rests on the same side. The learned dynamics model fills the table: over
+# 24 cm its median error is 3 to 5 deg, that of the quasi-static limit surface 10 to 20 deg.
 
 
 _SPARE_M = 0.003  # from where a push starts to what must stay clear
@@ -200,7 +200,7 @@ _ROUND = 24  # directions in which the loop around an object is rounded
 
 
 class PushPredictor(Protocol):
-    """Predicts pushes that begin elsewhere: `PushModel.rollout`."""
+    """Predicts pushes from several starts of the pusher: `PushModel.rollout`."""
 
     def __call__(
         self,
@@ -209,21 +209,21 @@ class PushPredictor(Protocol):
         before: SceneState | None = None,
         pushers: Float[np.ndarray, "K 2"] | None = None,
     ) -> Rollouts:
-        """Predicted poses under K sequences of T actions, each from its own place of the pusher [m]."""
+        """Predict poses under K sequences of T actions, each with its own start of the pusher [m]."""
         ...
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PushOutcomes:
-    """P straight pushes and where each has brought the object after S lengths, in the object's planar frame.
+    """P straight pushes and the poses of the object after S lengths of each, in the object's planar frame.
 
     Attributes:
-        starts: of the pusher's centre, clear of the object [m].
+        starts: position of the pusher's centre at the start, clear of the object [m].
         directions: unit vectors.
-        lengths: of the way from the start [m].
-        centres: of mass [m].
+        lengths: lengths of the way from the start [m].
+        centres: centres of mass [m].
         quaternions: orientations.
-        loop: a way around the object, clear of it, counterclockwise [m].
+        loop: closed path around the object, clear of it, counterclockwise [m].
     """
 
     starts: Float[np.ndarray, "P 2"]
@@ -240,13 +240,13 @@ def push_outcomes(
     centre: Float[np.ndarray, "3"],
     outlines: Sequence[Float[np.ndarray, "_ 2"]],
 ) -> PushOutcomes:
-    """Make the table of an object.
+    """Return the table of pushes of an object.
 
     Args:
-        predict: predicts what pushes do; without it, the table is empty.
-        state: of a scene with this object alone.
-        centre: of mass, in the object's frame [m].
-        outlines: of its convex parts seen from above [m].
+        predict: predicts the effect of pushes; None for an empty table.
+        state: state of a scene with this object alone.
+        centre: centre of mass, in the object's frame [m].
+        outlines: outlines of its convex parts seen from above [m].
     """
     pose = state.poses[0]
     origin = pose.apply(centre)[:2]
@@ -275,7 +275,7 @@ def _between(values: Float[np.ndarray, "P T1 D"]) -> Float[np.ndarray, "P S D"]:
 def silhouette(outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "V 2"]:
     """Trace the outer outline of a union of convex outlines, counterclockwise, within a millimetre [m].
 
-    Gaps that the pusher does not fit into are closed, and what is still apart is joined by the convex hull.
+    Gaps that the pusher does not fit into are closed. Pieces that are still separate are joined by their convex hull.
     """
     every = np.concatenate(list(outlines))
     border = PUSHER_RADIUS_M + 3 * _PIXEL_M
@@ -296,7 +296,7 @@ def silhouette(outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray
 
 
 def _candidates(outline: Float[np.ndarray, "V 2"]) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2"]]:
-    """Choose starts and directions of pushes from all around."""
+    """Return starts and directions of pushes from all sides."""
     points = _spaced(outline, _PLACES)
     tangent = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
     normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
@@ -319,7 +319,7 @@ def _spaced(outline: Float[np.ndarray, "V 2"], count: int) -> Float[np.ndarray, 
 def _along_closed(
     outline: Float[np.ndarray, "V 2"], places: Callable[[float], Float[np.ndarray, "n"]]
 ) -> Float[np.ndarray, "n 2"]:
-    """Return points of a closed line at distances from its first corner, which `places` gives for its length."""
+    """Return points of a closed line at distances from its first corner; `places` computes them from its length."""
     closed = np.vstack([outline, outline[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     at = places(along[-1])
@@ -357,16 +357,16 @@ def outline_points(outlines: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.nda
 def straight_pushes(
     outline: Float[np.ndarray, "K 2"], offset: Float[np.ndarray, "2"], count: int, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "count 2"], Float[np.ndarray, "count 2"]]:
-    """Draw straight pushes that bring an object about as far as it has to go.
+    """Draw straight pushes that move an object about as far as its goal is away.
 
     Args:
-        outline: of the object from above, points all along it, see `outline_points` [m].
-        offset: how far it has to go [m], not zero.
-        count: how many to draw.
-        rng: draws directions, places beside the middle and lengths.
+        outline: points all along the object's outline from above, see `outline_points` [m].
+        offset: vector from the object to its goal [m], not zero.
+        count: number of pushes.
+        rng: random generator of directions, offsets from the middle, and lengths.
 
     Returns:
-        Starts of the pusher's centre, free of the object, and its ends, where the object should have arrived [m].
+        Starts of the pusher's centre, clear of the object, and its ends [m].
     """
     direction_to, distance = np.arctan2(offset[1], offset[0]), np.linalg.norm(offset)
     turn = rng.normal(0, _ANGLE_RAD, count)
@@ -387,16 +387,16 @@ def straight_pushes(
 
 # Recombination of rollouts: pushes that succeeded in some futures, done one after another in the best order.
 #
-# A sampled sequence pushes several objects, and few samples push all of them well. Each future is cut into stages:
-# the actions from the first that moves an object up to the first that moves another one instead. What a stage does
-# to an object that nothing moved before, it does as well if it comes first. Sequences of up to three stages of
-# different objects are ranked by what they take from the cost of `PoseCost`, if stages do not disturb each other,
+# A sampled sequence pushes several objects, and few samples push all of them well. Each future is cut into stages: the
+# actions from the first that moves an object up to the first that moves another one instead. A stage whose object
+# nothing moved before has the same effect if it comes first. Sequences of up to three stages of different objects are
+# ranked by how much they lower the cost of `PoseCost`, if stages do not disturb each other,
 #
 #     sum_i g_i (2 + (T - t_i) / T),        t_i <= T,
 #
-# with g_i what stage i takes from the sum of the objects' costs, and t_i when it ends. The best are returned as
-# sequences of actions with collision-free paths between the stages, to be rolled out. (As crossover recombines
-# solutions in genetic algorithms; here what is exchanged is known to work.)
+# with g_i the amount by which stage i lowers the sum of the objects' costs, and t_i its end. The best are returned as
+# sequences of actions with collision-free paths between the stages, to be rolled out. This is like crossover in genetic
+# algorithms, except that the exchanged parts are known to work.
 
 
 _MOVED_M, _MOVED_Q = 1e-4, 1e-3  # by an action: in place, and a component of the quaternion
@@ -411,15 +411,15 @@ _DETOUR = 1.0  # actions by which a path is longer than the straight one, about
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PushStage:
-    """Actions that bring an object nearer to its goal.
+    """Actions that bring an object closer to its goal.
 
     Attributes:
-        number: of the object.
+        number: index of the object.
         actions: velocities of the pusher [m/s].
-        start: where the pusher begins [m].
-        end: where it ends [m].
-        pose: of the object then.
-        gain: what is taken from the sum of the objects' costs [m].
+        start: position of the pusher at the start [m].
+        end: position of the pusher at the end [m].
+        pose: pose of the object at the end.
+        gain: decrease of the sum of the objects' costs [m].
     """
 
     number: int
@@ -433,13 +433,13 @@ class PushStage:
 def recombined(
     rollouts: Rollouts, costs: Float[np.ndarray, "K T1 N"], outlines: OutlinesAt, count: int
 ) -> Float[np.ndarray, "C T 3"]:
-    """Make sequences of stages of other sequences.
+    """Combine stages of different sequences into new sequences.
 
     Args:
-        rollouts: futures of those, from one state.
-        costs: of each object in them, before the first and after each action [m].
-        outlines: returns those of an object at a pose [m].
-        count: of sequences at most; fewer or none come back where no stage brings anything nearer.
+        rollouts: futures of the sequences, all from one state.
+        costs: costs of each object in them, before the first and after each action [m].
+        outlines: function that returns the outlines of an object at a pose [m].
+        count: largest number of new sequences. Fewer or none come back if no stage brings an object closer.
     """
     horizon = rollouts.positions.shape[1] - 1
     pusher = rollouts.pusher[0, 0, :2]
@@ -450,11 +450,11 @@ def recombined(
 
 
 def push_stages(rollouts: Rollouts, costs: Float[np.ndarray, "K T1 N"]) -> dict[int, list[PushStage]]:
-    """Find the best stages of each object that any brings nearer, the best first.
+    """Return the best stages of each object, the best first, if any brings it closer to its goal.
 
     Args:
-        rollouts: futures from one state.
-        costs: of each object in them, before the first and after each action [m].
+        rollouts: futures that begin in one state.
+        costs: costs of each object in them, before the first and after each action [m].
     """
     moves = _moves(rollouts)
     horizon, total = moves.shape[1], costs.sum(axis=2)
@@ -472,14 +472,14 @@ def push_stages(rollouts: Rollouts, costs: Float[np.ndarray, "K T1 N"]) -> dict[
 
 
 def _actions_alone(moves: Bool[np.ndarray, "t N"], n: int, fresh: Bool[np.ndarray, "N"]) -> int:
-    """Count actions before the first that moves an object which nothing moved before, or another one instead of n."""
+    """Count actions before the first that moves an object for the first time, or another object instead of n."""
     others = moves & (np.arange(moves.shape[1]) != n)
     ends = (others & (fresh | ~moves[:, n, None])).any(axis=1)
     return int(ends.argmax()) if ends.any() else len(moves)
 
 
 def _moves(rollouts: Rollouts) -> Bool[np.ndarray, "K T N"]:
-    """Find which objects each action moves."""
+    """Return which objects each action moves."""
     shift = np.linalg.norm(np.diff(rollouts.positions, axis=1), axis=-1)
     turn = np.abs(np.diff(rollouts.quaternions, axis=1)).max(axis=-1)
     return (shift > _MOVED_M) | (turn > _MOVED_Q)
@@ -488,7 +488,7 @@ def _moves(rollouts: Rollouts) -> Bool[np.ndarray, "K T N"]:
 def _distinct(
     n: int, found: Sequence[tuple[float, int, int, int]], rollouts: Rollouts, total: Float[np.ndarray, "K T1"]
 ) -> list[PushStage]:
-    """Make the first few stages that begin at different places, of (worth, sequence, first action, end)."""
+    """Return the first few stages with different starts, given (worth, sequence, first action, end)."""
     kept: list[PushStage] = []
     for _, k, begin, end in found:
         path = rollouts.pusher[k, begin : end + 1]
@@ -506,7 +506,7 @@ def _distinct(
 def _best_chains(
     stages: Mapping[int, list[PushStage]], pusher: Float[np.ndarray, "2"], horizon: int, count: int
 ) -> list[list[PushStage]]:
-    """Chain stages of different objects in the orders that take most from the cost, as predicted before a rollout."""
+    """Chain stages of different objects in the orders that lower the cost most, as predicted before a rollout."""
     ranked = sorted(stages, key=lambda n: -max(stage.gain for stage in stages[n]))[:_OBJECTS]
     scored: list[tuple[float, list[PushStage]]] = []
     for order in permutations(ranked, min(_STAGES, len(ranked))):
@@ -519,7 +519,7 @@ def _best_chains(
 def _scored_chains(
     choices: Sequence[list[PushStage]], pusher: Float[np.ndarray, "2"], horizon: int, count: int
 ) -> list[tuple[float, list[PushStage]]]:
-    """Find the best choices of one stage of each object in a given order, with what they take from the cost."""
+    """Return the best choices of one stage of each object in this order, with their decrease of the cost."""
     at, when, score = pusher[None], np.zeros(1), np.zeros(1)
     for own in choices:
         starts, ends = (np.array([getattr(stage, place) for stage in own]) for place in ("start", "end"))
@@ -537,14 +537,14 @@ def _scored_chains(
 
 
 class _Walks:
-    """Shortest paths to stages, when those before them have been done; computed once for each that begins alike."""
+    """Shortest paths to stages after earlier stages. Each path is computed once for all chains that begin alike."""
 
     def __init__(self, pusher: Float[np.ndarray, "2"], here: Pose, outlines: OutlinesAt) -> None:
         self._pusher, self._here, self._outlines = pusher, here, outlines
         self._known: dict[tuple[int, ...], ShortestPaths] = {}
 
     def to(self, stage: PushStage, done: Sequence[PushStage]) -> Float[np.ndarray, "n 2"]:
-        """Corners of the path to the start of a stage [m]."""
+        """Return the corners of the path to the start of a stage [m]."""
         key = tuple(map(id, done))
         if key not in self._known:
             moved = {one.number: one.pose for one in done}
@@ -555,7 +555,7 @@ class _Walks:
 
 
 def _actions(chain: Sequence[PushStage], walks: _Walks, horizon: int) -> Float[np.ndarray, "T 3"]:
-    """Walks and stages in turn, as long as there is time; then rest."""
+    """Return the actions of walks and stages in turn, up to the horizon; then zeros."""
     actions = np.zeros((0, 3))
     for number, stage in enumerate(chain):
         walk = actions_along(walks.to(stage, chain[:number]), horizon)
@@ -570,10 +570,10 @@ def _actions(chain: Sequence[PushStage], walks: _Walks, horizon: int) -> Float[n
 # Up to three pushes that bring an object to a pose, by search over tables of pushes (Song et al., 2020, go deeper).
 #
 # With e = (x, y, yaw) the goal in the object's planar frame and m_i the motion of push i, one push leaves e' =
-# m_i^-1 e, and the last push is the one in the table whose motion is nearest to e'. First pushes of two are a part
-# of the table, first and second pushes of three are drawn; three let a can on its side, which rolls under most
-# pushes, be slid along its axis, turned and slid back. A first push may roll the object onto the side that the goal
-# shows; later pushes are then those of that side. Sequences are drawn by
+# m_i^-1 e, and the last push is the one in the table whose motion is nearest to e'. First pushes of two are a part of
+# the table; first and second pushes of three are drawn at random. A can on its side rolls under most pushes; three
+# pushes can slide it along its axis, turn it and slide it back. A first push may roll the object onto the side that the
+# goal shows; later pushes are then those of that side. Sequences are drawn by
 #
 #     s = sqrt(x^2 + y^2 + (arm * angle)^2) of what is left + price * (length of the pusher's path)
 #
@@ -595,8 +595,8 @@ class ObjectPushes:
 
     Args:
         outcomes: table of its pushes on that side.
-        reference: orientation that the table was made in.
-        centre: of mass, in the object's frame [m].
+        reference: orientation of the object in the table.
+        centre: centre of mass, in the object's frame [m].
     """
 
     def __init__(
@@ -614,7 +614,7 @@ class ObjectPushes:
         self.rolls = len(self._planar) < _STEADY * len(self._turns)
 
     def yaw(self, pose: Pose) -> float | None:
-        """Turn about the vertical from the pose that the table was made in; None if the object lies on another side."""
+        """Return the turn about the vertical from the table's orientation [rad]; None if it lies on another side."""
         return planar_turn(self._reference, pose.quaternion)
 
     def draw(
@@ -627,16 +627,16 @@ class ObjectPushes:
         count: int,
         rng: np.random.Generator,
     ) -> DrawnPushes:
-        """Sequences of up to three pushes that bring the object nearer.
+        """Return sequences of up to three pushes that bring the object closer to its goal.
 
         Args:
-            pose: of the object, on the side that the table was made for.
-            goal: where it should be.
-            later: pushes on the side that the goal shows: these ones, or others if that is another side.
-            space: where first pushes may begin.
-            pusher: where it comes from [m].
-            count: of sequences at most; fewer or none where no push that has room brings the object nearer.
-            rng: draws them.
+            pose: pose of the object, on the side that the table was made for.
+            goal: goal pose of the object.
+            later: pushes on the side that the goal shows, which may be this object itself.
+            space: free space in which first pushes may begin.
+            pusher: present position of the pusher [m].
+            count: largest number of sequences. Fewer or none come back if no push with room brings the object closer.
+            rng: random generator.
         """
         yaw, centre = self.yaw(pose) or 0.0, pose.apply(self._centre)[:2]
         turn = _rotation(yaw)
@@ -659,7 +659,7 @@ class ObjectPushes:
         return DrawnPushes(len(kept), count, lambda k: self._corners(kept[k], first, later) @ turn.T + centre)
 
     def _first_pushes(self, rows: Int[np.ndarray, "M"], yaw: float, goal: Pose, later: ObjectPushes) -> _FirstPushes:
-        """Compute what pushes of the table do to an object that is turned by `yaw`, in the frame of later ones."""
+        """Return the effect of the table's pushes on an object turned by `yaw`, in the frame of later pushes."""
         around = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
         ends = quaternion_multiply(quaternion_multiply(around, self._turns[rows]), self._reference)
         then, _ = planar_turns(later._reference, ends)
@@ -671,7 +671,7 @@ class ObjectPushes:
     def _path_lengths(
         self, rows: Int[np.ndarray, "C 3"], first: _FirstPushes, later: ObjectPushes, pusher: Float[np.ndarray, "2"]
     ) -> Float[np.ndarray, "C"]:
-        """Estimate how far the pusher goes, straight from push to push [m]."""
+        """Return the length of the pusher's path, straight from push to push [m]."""
         own = first.rows[rows[:, 0]]
         path = self._walked(own, np.broadcast_to(pusher, (len(own), 2)))
         at = _into(first.motions[rows[:, 0]], self._ends[own])
@@ -687,7 +687,7 @@ class ObjectPushes:
         )
 
     def _corners(self, row: Int[np.ndarray, "3"], first: _FirstPushes, later: ObjectPushes) -> Float[np.ndarray, "C 2"]:
-        """Compute the pusher's path through pushes, in the planar frame before the first."""
+        """Return the pusher's path through pushes, in the planar frame before the first."""
         own, motion = first.rows[row[0]], first.motions[row[0]]
         then = later._path_through([int(push) for push in row[1:] if push >= 0])
         return self._followed_by(int(own), motion, then, later._outcomes.loop)
@@ -710,7 +710,7 @@ class ObjectPushes:
         return np.vstack([path, back, np.vstack([around, then]) @ _rotation(motion[2]).T + motion[:2]])
 
     def leave(self, pose: Pose, at: Float[np.ndarray, "2"], toward: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 2"]:
-        """Corners of a way around the object to the point of its loop that is nearest to another place."""
+        """Return the corners of a path around the object to the point of its loop closest to another place."""
         turn, centre, loop = _rotation(self.yaw(pose) or 0.0), pose.apply(self._centre)[:2], self._outcomes.loop
         own, aim = turn.T @ (at - centre), turn.T @ (toward - centre)
         exit_ = loop[np.linalg.norm(loop - aim, axis=1).argmin()]
@@ -718,23 +718,24 @@ class ObjectPushes:
 
 
 class DrawnPushes:
-    """Push sequences that were drawn, the best first. Paths are computed when they are asked for: few of them are.
+    """Push sequences that were drawn, the best first. Paths are computed on demand, since few of them are used.
 
     Args:
-        known: how many sequences there are.
-        wanted: how many of them may be used; those that lead out of the pusher's reach do not count.
-        path: corners of the pusher's path of one of them, from the start of the first push to the end of the last [m].
+        known: number of sequences.
+        wanted: largest number of sequences to use. Those that leave the pusher's reach do not count.
+        path: function that returns the corners of a sequence's path, from the start of the first push to the end of the
+            last [m].
     """
 
     def __init__(self, known: int, wanted: int, path: Callable[[int], Float[np.ndarray, "C 2"]]) -> None:
         self._known, self._wanted, self._path = known, wanted, cache(path)
 
     def __iter__(self) -> Iterator[Float[np.ndarray, "C 2"]]:
-        """Paths within the pusher's reach."""
+        """Yield paths within the pusher's reach."""
         return islice(self._within(range(self._known)), self._wanted)
 
     def sample(self, count: int, rng: np.random.Generator) -> list[Float[np.ndarray, "C 2"]]:
-        """So many of them at most, in random order."""
+        """Return at most `count` of them, in random order."""
         best = min(self._wanted, self._known)
         order = chain(rng.permutation(best).tolist(), range(best, self._known))
         return list(islice(self._within(order), count))
@@ -745,13 +746,13 @@ class DrawnPushes:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _FirstPushes:
-    """Some rows of a table, and what they lead to.
+    """Some rows of a table of pushes, and their effects.
 
     Attributes:
-        rows: of the table.
+        rows: rows of the table.
         motions: shift in the planar frame before, and turn from it to the planar frame of later pushes [m, rad].
-        tilts: from the side that the goal shows [rad].
-        angles: of the whole rotation to the goal [rad].
+        tilts: tilts from the side that the goal shows [rad].
+        angles: angles of the whole rotation to the goal [rad].
     """
 
     rows: Int[np.ndarray, "M"]
@@ -761,22 +762,22 @@ class _FirstPushes:
 
     @property
     def lands(self) -> Bool[np.ndarray, "M"]:
-        """True where the object lies on that side then."""
+        """Whether the object then lies on the side that the goal shows."""
         return self.tilts <= UPRIGHT_RAD
 
 
 def _sequences(
     first: _FirstPushes, target: Float[np.ndarray, "3"], later: ObjectPushes, rng: np.random.Generator
 ) -> tuple[Int[np.ndarray, "C 3"], Float[np.ndarray, "C"]]:
-    """List sequences of up to three pushes, and the error that they leave [m].
+    """Return sequences of up to three pushes, and the error that each leaves [m].
 
-    A sequence is the number of its first push, then rows of the table of later ones, -1 for none.
+    A sequence holds the index of its first push, then rows of the table of later pushes; -1 for none.
 
     Args:
-        first: pushes that are possible.
+        first: possible first pushes.
         target: the goal in the planar frame before the first, with its turn in that of later pushes.
         later: pushes on the goal's side.
-        rng: draws first and second pushes of three.
+        rng: random generator of first and second pushes of three.
     """
     motions, planar, tree = later._motions, later._planar, later._tree
     left = np.hypot(np.linalg.norm(target[:2] - first.motions[:, :2], axis=1), ARM_M * first.angles)
@@ -799,7 +800,7 @@ def _sequences(
 def around_loop(
     loop: Float[np.ndarray, "L 2"], begin: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Return corners of the shorter way along a closed convex line, from near one place to near another [m]."""
+    """Return the corners of the shorter way along a closed convex line, between places near it [m]."""
     i, j = (int(np.linalg.norm(loop - place, axis=1).argmin()) for place in (begin, end))
     forth = np.arange(i, i + (j - i) % len(loop) + 1) % len(loop)
     back = np.arange(i, i - (i - j) % len(loop) - 1, -1) % len(loop)
@@ -812,7 +813,7 @@ def _rotation(angle: float) -> Float[np.ndarray, "2 2"]:
 
 
 def _into(motions: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
-    """Express points in the frame of an object that has made motions."""
+    """Return points in the frame of an object after its motions."""
     cos, sin = np.cos(motions[:, 2]), np.sin(motions[:, 2])
     x, y = (points - motions[:, :2]).T
     return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
@@ -821,7 +822,7 @@ def _into(motions: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "M 2"]) -
 def _after(
     goal: Float[np.ndarray, "3"] | Float[np.ndarray, "M 3"], motions: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "M 3"]:
-    """Express goals (x, y, yaw) in the frame of an object that has made motions: m^-1 e."""
+    """Return goals (x, y, yaw) in the frame of an object after its motions: m^-1 e."""
     goals = np.broadcast_to(goal, motions.shape)
     yaw = (goals[:, 2] - motions[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return np.concatenate([_into(motions, goals[:, :2]), yaw[:, None]], axis=1)
@@ -829,11 +830,11 @@ def _after(
 
 # Push proposals: samples for MPPI that push one object after another to its goal.
 #
-# Random velocities touch an object in one of eight sequences, so sampling alone rarely finds a path around an
-# object, let alone pushes of three objects one after another. A proposal is a whole sequence of actions for an
-# order of stages (`push_orders`): a collision-free path (`osfcore.planning.paths`) to an object, up to three pushes
-# toward its pose (`ObjectPushes`) or a straight one toward its place (`straight_pushes`), then the same for the next
-# stage, as if this one had succeeded.
+# Random velocities touch an object in one of eight sequences. So sampling alone rarely finds a path around an object,
+# and hardly ever pushes of three objects one after another. A proposal is a whole sequence of actions for an order of
+# stages (`push_orders`). It has a collision-free path (`osfcore.planning.paths`) to an object, then up to three pushes
+# toward its pose (`ObjectPushes`) or a straight push toward its position (`straight_pushes`), then the same for the
+# next stage, as if this stage had succeeded.
 
 
 _REACHED_M, _REACHED_RAD = 0.004, 0.045  # an object this close to its goal is not pushed on purpose
@@ -846,11 +847,19 @@ _STRAIGHT = 0.25  # share of pushes that are aimed at the goal's place alone
 
 
 class PushProposals:
-    """Proposes pushes among some objects.
+    """Proposes sequences of straight pushes that bring objects to their goals.
 
     Args:
-        shapes: of the objects, by name.
-        predict: fills tables of pushes; without it, all pushes are straight ones toward the goal's place.
+        shapes: shapes of the objects, by name.
+        predict: rollout of a dynamics model, which computes what a push from each side does; None to propose only
+            pushes straight toward the goal's position.
+
+    Example:
+        >>> proposals = PushProposals(load_shapes(None, fields, [name]))
+        >>> rng = np.random.default_rng(0)
+        >>> actions = proposals.draw(state, goal, count=20, horizon=30, rng=rng)
+        >>> actions.shape[1:]  # 30 velocities (vx, vy, 0) [m/s]
+        (30, 3)
     """
 
     def __init__(self, shapes: Mapping[str, ObjectShape], predict: PushPredictor | None = None) -> None:
@@ -861,14 +870,15 @@ class PushProposals:
     def draw(
         self, state: SceneState, goal: PoseGoal, count: int, horizon: int, rng: np.random.Generator
     ) -> Float[np.ndarray, "P T 3"]:
-        """Propose about `count` sequences; none where everything is in its place or the pusher has no room.
+        """Propose about `count` sequences of actions [m/s].
 
         Args:
-            state: of the scene, with its pusher.
-            goal: where everything should be.
-            count: of sequences.
-            horizon: length of the sequences.
-            rng: draws orders, angles, offsets, lengths and speeds.
+            state: state of the scene, with a pusher.
+            goal: the goal poses.
+            count: largest number of sequences. None come back if all objects are at their goals, or the pusher has no
+                room.
+            horizon: actions in each sequence (T).
+            rng: random generator of orders, angles, offsets, lengths and speeds.
         """
         now, goals = ([of.pose(name) for name in state.names] for of in (state, goal))
         off = [n for n, (here, there) in enumerate(zip(now, goals, strict=True)) if _is_off(here, there)]
@@ -887,17 +897,17 @@ class PushProposals:
         return np.array(proposals[:count]).reshape(-1, horizon, 3)
 
     def recombine(self, goal: PoseGoal, rollouts: Rollouts, count: int) -> Float[np.ndarray, "P T 3"]:
-        """At most `count` sequences of pushes that succeeded in different futures (`recombined`).
+        """Return at most `count` sequences [m/s] that combine successful pushes of different futures.
 
         Args:
-            goal: where everything should be.
-            rollouts: the futures, from one state.
-            count: of sequences.
+            goal: the goal poses.
+            rollouts: futures that begin in one state.
+            count: largest number of sequences.
         """
         return recombined(rollouts, object_costs(rollouts, goal), self._outlines(rollouts.names), count)
 
     def _outlines(self, names: Sequence[str]) -> OutlinesAt:
-        """Return a function that computes the outlines of objects, each pose's once."""
+        """Return a function that computes the outlines of objects, once for each pose."""
         known: dict[tuple[int, bytes], Outlines] = {}
 
         def at(n: int, pose: Pose) -> Outlines:
@@ -929,7 +939,7 @@ def _is_off(pose: Pose, goal: Pose) -> bool:
 
 
 class _PushSequences:
-    """Samples sequences of pushes; what several orders that begin alike need is computed once."""
+    """Samples sequences of pushes. Computations that several orders share are done once."""
 
     def __init__(
         self, pusher: Float[np.ndarray, "2"], now: Sequence[Pose], pushes: Callable[[int, Pose], ObjectPushes],
@@ -940,7 +950,7 @@ class _PushSequences:
         self._known: dict[tuple[bytes, ...], _Leg] = {}
 
     def draw(self, order: tuple[Stage, ...], count: int) -> list[Float[np.ndarray, "T 3"]]:
-        """Draw sequences that go through stages in this order, as far as time and room allow."""
+        """Draw sequences of stages in this order, as far as the horizon and the room allow."""
         corners = [[self._pusher] for _ in range(count)]
         speeds: list[list[float]] = [[] for _ in range(count)]
         limit_s = self._horizon * STEP_S
@@ -962,7 +972,7 @@ class _PushSequences:
         return [actions_along(np.array(c), self._horizon, np.array(s)) for c, s in zip(corners, speeds, strict=True)]
 
     def _leg(self, stages: tuple[Stage, ...]) -> _Leg:
-        """Prepare the last of some stages, when those before it have succeeded."""
+        """Prepare the last of some stages, as if the earlier ones had succeeded."""
         key = tuple(part for one in stages for part in (bytes([one.number]), one.target.position.tobytes()))
         if key not in self._known:
             places = list(self._now)
@@ -996,16 +1006,16 @@ class _PushSequences:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Leg:
-    """A stage, when those before it have succeeded.
+    """A stage, as if the earlier ones had succeeded.
 
     Attributes:
-        here: where its object is.
-        space: where the pusher can be.
-        begin: where it sets out: now, or beside the object of the stage before.
-        paths: from there.
-        around: pushes and pose of the object of the stage before, which it walks around first.
+        here: pose of its object.
+        space: free space of the pusher.
+        begin: start of the pusher: its present position, or beside the object of the stage before.
+        paths: shortest paths from there.
+        around: pushes and pose of the object of the stage before, which the pusher first walks around.
         pool: pushes to choose from.
-        rolls: the object rolls under some pushes, of which straight ones take no heed.
+        rolls: whether the object rolls under some pushes, which straight pushes do not consider.
     """
 
     here: Pose
@@ -1017,7 +1027,7 @@ class _Leg:
     rolls: bool
 
     def walk(self, at: Float[np.ndarray, "2"], start: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "2"]]:
-        """Corners of a path to the start of a push."""
+        """Return the corners of a path to the start of a push [m]."""
         path = list(self.paths.to(start)[1:])
         if self.around is None:
             return path

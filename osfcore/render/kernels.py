@@ -1,6 +1,6 @@
 """Compiled ray marching through several fields on a table, with shadows, under distant and near lamps.
 
-From the layers of tiny networks up to whole images; `renderer.py` alone calls it.
+It has everything from the layers of tiny networks to whole images. Only `renderer.py` calls it.
 """
 
 # ruff: noqa: ANN001, ANN201, ANN202, D417 - compiled helpers; types are given by their callers

@@ -1,15 +1,17 @@
 """The reference renderer: compositional volume rendering of OSFs in PyTorch, every ray and every sample.
 
-It defines what the fast path must compute, and it is what a GPU runs. For each ray, each object's field is sampled in
-its own frame (paper eq. 1); a sample's radiance is rho L_light with one light, distant or near (eq. 2); the samples of
-all objects are sorted by distance and composited (eq. 3).
+The fast renderer must compute the same as this one, and a GPU runs this one. For each ray, each object's field is
+sampled in its own frame (paper eq. 1). A sample's radiance is rho L_light with one light, distant or near (eq. 2). The
+samples of all objects are sorted by distance and composited (eq. 3).
 
-Deviations from eq. 3: the radiance of a point is the mean of the objects' radiances weighted by their densities (as in
-compositional NeRFs), not their sum, so that overlapping objects do not shine twice as bright; and the light that
-reaches a point is the transmittance of all other objects along the ray toward the light, the limit of a shadow map of
-unlimited resolution.
+Deviations from eq. 3:
 
-Densities become weights and pixels as `osfcore.fields.volume_rendering` explains.
+- The radiance of a point is the mean of the objects' radiances weighted by their densities, as in compositional NeRFs,
+  and not their sum. Overlapping objects are then not twice as bright.
+- The light that reaches a point is the transmittance of all other objects along the ray toward the light. This is the
+  limit of a shadow map of unlimited resolution.
+
+`osfcore.fields.volume_rendering` explains how densities become weights and pixels.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.render.types import EXACT, Quality, Rendered, SceneBatch, camera_numbers, check_request, poses_of
 
-# The lights: what points of the world receive from a distant one, and from a near lamp.
+# Lights: the light that points of the world receive from a distant light, and from a near lamp.
 #
 # Both have the same four methods. `SpotLamp` has the equations of the lamp.
 
@@ -43,24 +45,24 @@ FAR = 1e9
 
 
 class DistantLight(NamedTuple):
-    """A light in the same direction from everywhere."""
+    """A distant light, with the same direction at all points."""
 
     direction: Float[Tensor, "3"]
 
     def toward(self, points: Float[Tensor, "R 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "R 3"]:
-        """Return unit vectors from points [m] toward the light; `rotation` leads from the world into their frame."""
+        """Return unit vectors from points [m] toward the light; `rotation` maps from the world to their frame."""
         return (rotation @ self.direction).expand_as(points)
 
     def distance(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R"]:
-        """Return distances from points to the light [m]; what lies beyond it casts no shadow."""
+        """Return distances from points to the light [m]. Objects beyond the light cast no shadow."""
         return torch.full_like(points[:, 0], FAR)
 
     def gain(self, points: Float[Tensor, "R 3"]) -> Float[Tensor, "R 1"]:
-        """Return the share of the diffuse light that arrives at points where nothing shades them."""
+        """Return the share of the diffuse light that arrives at unshaded points."""
         return torch.ones_like(points[:, :1])
 
     def on_table(self, table: TableField, points: Float[Tensor, "R 3"]) -> Float[Tensor, "#R 3"]:
-        """Return direct light of three colours on a white table at points of it where nothing shades them."""
+        """Return the direct light of three colours on unshaded points of a white table."""
         return torch.as_tensor(table.direct(self.direction.cpu().double().numpy()[None])).to(points)
 
 
@@ -102,7 +104,7 @@ _SOLID_G = 10.0
 
 
 def pusher_field(hidden: int) -> KiloOSF:
-    """Return the pusher, around its centre: a matte cylinder of known colour."""
+    """Return the field of the pusher: a matte cylinder of known colour around its centre."""
     half = PUSHER_HEIGHT_M / 2
 
     def depth(x: Float[np.ndarray, "*s 3"]) -> Float[np.ndarray, "*s"]:
@@ -131,14 +133,14 @@ def solid_field(
     """Make a matte solid under the world's lamp.
 
     Args:
-        depth: how deep points lie inside the solid, negative outside [m].
-        normal: outward unit vectors at points near the surface.
-        half_size: of its box around the origin [m].
-        albedo: its reflectance.
+        depth: function from points to their depth inside the solid [m], negative outside.
+        normal: function from points near the surface to outward unit vectors.
+        half_size: half the sides of its box around the origin [m].
+        albedo: reflectance of the solid.
         voxel: side of the voxels [m].
-        hidden: width of the (empty) networks: that of the fields it is drawn with.
+        hidden: width of the (empty) networks, which must be that of the fields it is drawn with.
         g: density feature inside.
-        edge_g: how fast the density feature grows across the surface, per voxel.
+        edge_g: growth of the density feature across the surface, per voxel.
     """
     count = 2 * (np.ceil(np.asarray(half_size) / voxel).astype(int) + 2) + 1
     origin = -(count - 1) / 2 * voxel
@@ -187,13 +189,13 @@ def render_reference(
     """Render one scene from one camera.
 
     Args:
-        fields: by name.
-        table: None for black surroundings.
+        fields: fields of the objects, by name.
+        table: field of the table; None for a black background.
         state: the scene.
-        camera: the view.
-        spot: a near lamp in the place of the state's light.
-        dtype: to compute in.
-        quality: only its spacing of samples and rays per pixel count; nothing is skipped here.
+        camera: the camera.
+        spot: a near lamp in place of the state's light.
+        dtype: data type of the computation.
+        quality: accuracy, of which only the sample spacing and the rays per pixel are used. Nothing is skipped here.
         outputs: as in `SceneRenderer.render`.
 
     Raises:
@@ -212,12 +214,12 @@ def render_on_device(
     """Render a batch in single precision on a PyTorch device.
 
     Args:
-        fields: by name.
-        table: None for black surroundings.
+        fields: fields of the objects, by name.
+        table: field of the table; None for a black background.
         batch: B scenes.
         cameras: V cameras of one image size.
-        device: PyTorch's name of it.
-        quality: only its spacing of samples and rays per pixel count; nothing is skipped here.
+        device: PyTorch device.
+        quality: accuracy, of which only the sample spacing and the rays per pixel are used. Nothing is skipped here.
         outputs: as in `SceneRenderer.render`.
         only: pixels to keep; all others come out black and empty.
     """

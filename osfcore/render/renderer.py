@@ -1,4 +1,4 @@
-"""The fast renderer: whole batches of scenes from several cameras in one call of compiled code."""
+"""The fast renderer, which draws batches of scenes from several cameras in one call of compiled code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from osfcore.render.kernels import BAND_ROWS, GONE, MOVES, NO_OUTLINE, STILL, re
 from osfcore.render.reference import pusher_field, render_on_device
 from osfcore.render.types import EXACT, Quality, Rendered, SceneBatch, camera_numbers, check_request, poses_of
 
-# Fields laid end to end in flat arrays, as compiled code needs them.
+# Fields in flat arrays, one after the other, as compiled code needs them.
 
 
 class Packed(NamedTuple):
@@ -40,7 +40,7 @@ class Packed(NamedTuple):
         extents: N x 6: lowest and highest corner of the occupied part [m].
         ambient: N x 3.
         hidden: width of the networks, the same for all.
-        parameters: of one network.
+        parameters: parameters of one network.
     """
 
     density: np.ndarray
@@ -59,7 +59,7 @@ class Packed(NamedTuple):
 
 
 def pack(fields: Sequence[KiloOSF]) -> Packed:
-    """Lay fields end to end.
+    """Return fields in flat arrays, one after the other.
 
     Raises:
         InvalidInput: if their networks differ in width, or are too wide.
@@ -91,7 +91,7 @@ def _reach(field: KiloOSF) -> np.ndarray:
     return np.stack([low - field.voxel, high + field.voxel])
 
 
-# Near lamps for the compiled renderer: their places in every object's coordinates, and where their shadows fall.
+# Near lamps for the compiled renderer: their positions in every object's coordinates, and their shadows.
 
 
 _HIGHEST = 0.98  # of a lamp's height: what reaches higher may cast its shadow anywhere
@@ -129,15 +129,15 @@ def place_lamps(
     positions: Float[np.ndarray, "B N 3"],
     table: TableField | None,
 ) -> Lamps:
-    """Work out the lamps of B scenes in double precision.
+    """Return the lamps of B scenes, computed in double precision.
 
     Args:
-        spots: one for each scene.
+        spots: one lamp for each scene.
         pack: the fields.
-        numbers: which of them each object has.
-        rotations: from the world into each object's frame.
-        positions: of the objects [m].
-        table: what they shine on; None if there is none.
+        numbers: index of each object's field.
+        rotations: rotations from the world to each object's frame.
+        positions: positions of the objects [m].
+        table: field of the table; None if there is none.
     """
     scales = pack.scales[numbers].astype(float)
     place, axis = (np.array([getattr(spot, name) for spot in spots]) for name in ("position", "axis"))
@@ -158,7 +158,7 @@ def place_lamps(
 
 
 def below_lamps(points: Float[np.ndarray, "B N 8 3"], spots: Sequence[SpotLamp]) -> Float[np.ndarray, "B N 8 3"]:
-    """Drop points from lamps onto the plane z = 0; NaN where a point is about as high as the lamp, or higher."""
+    """Project points from lamps onto the plane z = 0; NaN for points about as high as the lamp, or higher."""
     lamps = np.array([spot.position for spot in spots])[:, None, None]
     height = lamps[..., 2:]
     is_below = points[..., 2:] < _HIGHEST * height
@@ -187,7 +187,7 @@ class Table(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Where everything is, in the voxel coordinates of each object and on the screens.
+    """Geometry of the scenes, in the voxel coordinates of each object and on the screens.
 
     Outlines are convex hulls of points on the screen [px], `NO_OUTLINE` where some are behind the camera; boxes hold
     them, or the whole screen: columns from, to, rows from, to.
@@ -227,7 +227,7 @@ class Scene(NamedTuple):
 
 
 class Base(NamedTuple):
-    """Images of what many scenes of a batch have in common: the table, and objects that are the same in all of them.
+    """Images of the common parts of a batch's scenes: the table, and objects with the same pose in many scenes.
 
     Attributes:
         of: B, which of L images each scene has; -1 for none.
@@ -259,11 +259,11 @@ def _shared(
     *,
     has_table: bool,
 ) -> tuple[Bool[np.ndarray, "B N"], Int[np.ndarray, "L"], Int[np.ndarray, "B"]]:
-    """Find what scenes have in common, so that it is drawn once: planning and derivatives move one object of many.
+    """Find the common parts of scenes, which are drawn once. Planning and derivatives move only one object of many.
 
     Returns:
-        For each scene, objects whose pose is the commonest of that object; L scenes, one for each set of two or more
-        that have the light and these objects in common; and which of these sets each scene is in, -1 for none.
+        For each scene, the objects with the most common pose of that object; L scenes, one for each set of two or more
+        with the same light and the same such objects; and the index of each scene's set, -1 for none.
     """
     scenes, count = positions.shape[:2]
     still = np.zeros((scenes, count), bool)
@@ -299,7 +299,7 @@ def _scene(
     positions: Float[np.ndarray, "B N 3"],
     lenses: Float[np.ndarray, "V 12"],
 ) -> Scene:
-    """Work out where everything is, in double precision: in voxel coordinates and on the screens; all objects move."""
+    """Return the geometry of the scenes, computed in double precision, with all objects marked as moving."""
     scales = pack.scales[numbers].astype(float)
     origin, voxel = scales[:, :3], scales[:, 3:]
     into = rotations / voxel[..., None]  # from the world
@@ -325,7 +325,7 @@ def _scene(
         *(eye, ray.reshape(*ray.shape[:3], 9), lit, inverse, between.reshape(scenes, count + 1, count, 12), direct),
         reach.reshape(-1, 6),
     )
-    # One memory layout for all batches: any other would be compiled anew, which takes half a minute.
+    # One memory layout for all batches: another one would need another compilation, which takes half a minute.
     *places, reach = (np.array(array, np.float32, order="C") for array in arrays)
     outlines = _outlines(pack.extents[numbers], rotations, positions, batch, cameras, has_table=table is not None)
     return Scene._make([*places, np.full((scenes, count), MOVES), *outlines, reach])
@@ -390,7 +390,7 @@ def screen_boxes(
 
 
 def _on_table(points: Float[np.ndarray, "B N 8 3"], lights: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B N 8 3"]:
-    """Drop points along the light onto the plane z = 0; lights below it count as just above it."""
+    """Project points along the light onto the plane z = 0. Lights below the plane count as just above it."""
     elevation = np.maximum(lights[:, 2], 1e-3)[:, None, None, None]
     dropped = points - lights[:, None, None] * points[..., 2:] / elevation  # points below it rise: none is left out
     dropped[..., 2] = 0
@@ -406,7 +406,7 @@ def plain_table(table: TableField | None) -> Table:
 
 
 def z_depth(distance: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Turn distances along rays into distances along the cameras' z axes."""
+    """Convert distances along rays to distances along the cameras' z axes."""
     result = np.empty_like(distance)
     for view, camera in enumerate(cameras):
         rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
@@ -419,24 +419,28 @@ _MOST_PACKS = 8
 
 
 class SceneRenderer:
-    """Renders scenes of known fields.
+    """Renders scenes of objects with known fields.
 
-    Volume rendering after paper eq. 3, weighted by density; shadows of objects and pusher fall on each other and on the
-    table with soft transmittance along the way to the light. An object does not shade itself here: its field already
-    holds that.
+    It does volume rendering after paper eq. 3, weighted by density. Objects and pusher cast soft shadows on each other
+    and on the table: the transmittance along the ray to the light. Shadows of an object on itself are part of its
+    field.
+
+    Args:
+        fields: fields of the objects, by name.
+        table: field of the table; None for a black background.
+        device: "cpu" for compiled code on all cores, "cuda" for PyTorch on a GPU, "auto" for a GPU if there is one.
+
+    Raises:
+        InvalidInput: if there is no such device.
+
+    Example:
+        >>> renderer = SceneRenderer({name: fields.load(name)}, fields.load_table())
+        >>> seen = renderer.render(SceneBatch.of(state), default_cameras(64), outputs={"rgb", "depth"})
+        >>> seen.rgb.shape, seen.depth.shape
+        ((1, 4, 64, 64, 3), (1, 4, 64, 64))
     """
 
     def __init__(self, fields: Mapping[str, KiloOSF], table: TableField | None, *, device: str = "cpu") -> None:
-        """Prepare fields.
-
-        Args:
-            fields: by name.
-            table: None for black surroundings.
-            device: "cpu" for compiled code on all cores, "cuda" for PyTorch on a GPU, "auto" for a GPU if there is one.
-
-        Raises:
-            InvalidInput: if there is no such device.
-        """
         self._fields = dict(fields)
         self._table = table
         self._device = "cpu" if device == "cpu" else pick_device(device).type
@@ -444,7 +448,7 @@ class SceneRenderer:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Objects that can be drawn."""
+        """Names of the objects that can be drawn."""
         return tuple(self._fields)
 
     def render(
@@ -461,13 +465,17 @@ class SceneRenderer:
         Args:
             batch: B scenes.
             cameras: V cameras of one image size.
-            quality: `EXACT` or `PLANNING`, or anything between.
-            outputs: which of "rgb", "opacity", "masks", "depth"; colours always come.
-            only: pixels to look at; all others stay black and empty.
+            quality: accuracy of the images, exact by default.
+            outputs: any of "rgb", "opacity", "masks", "depth". "rgb" is always returned.
+            only: pixels to render; all others stay black and empty.
+
+        Returns:
+            The images, as arrays over B scenes and V views.
 
         Raises:
-            UnknownName: if an object has no field here.
-            InvalidInput: if cameras differ in size, an output is unknown, or `only` is of another shape.
+            UnknownName: if this renderer has no field of an object.
+            InvalidInput: if there is no camera, the cameras differ in size, an output is unknown, or `only` has
+                another shape.
         """
         size = check_request(self._fields, batch, cameras, outputs)
         if only is not None and only.shape != (len(cameras), *size):
@@ -509,7 +517,7 @@ class SceneRenderer:
         return Rendered.of(rgb, opacity, depth, outputs)
 
     def _packed(self, batch: SceneBatch) -> tuple[Packed, np.ndarray]:
-        """Return the batch's fields, each packed once, and which of them each object has."""
+        """Return the batch's fields, each packed once, and the index of each object's field."""
         key = (batch.names, batch.pusher is not None)
         packed = self._packs.get(key)
         if packed is None:

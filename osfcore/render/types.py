@@ -1,4 +1,4 @@
-"""What the renderers share: scenes in, images out, the quality between them, and checks of requests."""
+"""What the renderers share: batches of scenes, images, quality settings, and checks of requests."""
 
 from __future__ import annotations
 
@@ -23,15 +23,22 @@ _FARTHEST_M = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """How carefully rays are followed.
+    """Accuracy of volume rendering: smaller steps and thresholds cost more time.
 
     Attributes:
-        step_voxels: distance between samples [voxels of the field].
-        min_weight: samples that show less are not coloured.
-        stop: a ray ends where less of what lies behind would show.
-        one_shadow: ask once per ray and object whether the light arrives, not at every sample.
-        shadow_voxels: distance between samples of shadow rays [voxels].
-        samples_per_side: rays per pixel, squared.
+        step_voxels: distance between samples along a ray [voxels of the field].
+        min_weight: smallest weight of a sample whose colour is computed.
+        stop: transmittance at which a ray ends.
+        one_shadow: whether to follow one shadow ray per ray and object, instead of one per sample.
+        shadow_voxels: distance between samples along a shadow ray [voxels of the field].
+        samples_per_side: square root of the number of rays per pixel.
+
+    Example:
+        >>> smooth = Quality(samples_per_side=2)  # four rays per pixel
+        >>> SceneRenderer({name: fields.load(name)}, table).render(
+        ...     SceneBatch.of(state), [goal_camera(64)], quality=smooth
+        ... ).rgb.shape
+        (1, 1, 64, 64, 3)
     """
 
     step_voxels: float = 0.5
@@ -48,18 +55,23 @@ PLANNING = Quality(step_voxels=1.0, min_weight=0.1, stop=0.03, one_shadow=True, 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneBatch:
-    """B scenes with the same objects.
+    """B scenes with the same objects, which a renderer draws together.
 
     Attributes:
-        names: of the N objects; each one's field is looked up under this name.
-        positions: of the objects [m].
-        quaternions: (w, x, y, z), unit.
-        lights: unit vectors toward the distant light; they play no part where there are near lamps.
-        pusher: its centre [m]; None where there is none.
-        spots: the near lamp of each scene, in the place of its distant light; None for distant lights.
+        names: names of the N objects. The renderer looks up their fields by these names.
+        positions: positions of the objects in the world [m].
+        quaternions: orientations of the objects in the world as unit quaternions (w, x, y, z).
+        lights: unit vectors toward the distant lights. They are ignored if `spots` is given.
+        pusher: centres of the pusher in the world [m]; None for scenes without a pusher.
+        spots: a near lamp for each scene in place of the distant light; None for distant lights.
 
     Raises:
-        InvalidInput: if an array has another shape, is not finite or not of unit length, or there are too many objects.
+        InvalidInput: if an array has another shape or numbers that are not finite, a vector or quaternion is not unit,
+            or there are more than 23 objects.
+
+    Example:
+        >>> SceneBatch.of(state).positions.shape
+        (1, 1, 3)
     """
 
     names: tuple[str, ...]
@@ -95,7 +107,7 @@ class SceneBatch:
 
     @staticmethod
     def of(state: SceneState, spot: SpotLamp | None = None) -> SceneBatch:
-        """Make a batch of one scene, under a near lamp in the place of its light if one is given."""
+        """Return a batch of one scene. A near lamp `spot` replaces the light of the state."""
         pusher = None if state.pusher is None else state.pusher[None]
         light = state.light if spot is None else spot.distant
         return SceneBatch(
@@ -106,13 +118,13 @@ class SceneBatch:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rendered:
-    """Images of B scenes from V cameras; what was not asked for is None.
+    """Images of B scenes from V cameras. Outputs that were not requested are None.
 
     Attributes:
         rgb: linear radiance in [0, 1].
-        opacity: how much of each pixel shows each object.
-        masks: pixels of which an object covers half or more.
-        depth: expected distance along the camera's z axis [m]; 0 where there is nothing.
+        opacity: share of each pixel that each object covers, in [0, 1].
+        masks: pixels that an object covers by half or more.
+        depth: expected distance along the camera's z axis [m]; 0 where a ray meets nothing.
     """
 
     rgb: Float32[np.ndarray, "B V h w 3"]
@@ -122,7 +134,7 @@ class Rendered:
 
     @staticmethod
     def of(rgb: np.ndarray, opacity: np.ndarray, depth: np.ndarray, outputs: Collection[str]) -> Rendered:
-        """Keep of everything that was drawn what was asked for."""
+        """Return the requested outputs of everything that was drawn."""
         return Rendered(
             rgb,
             opacity if "opacity" in outputs else None,
@@ -132,7 +144,7 @@ class Rendered:
 
 
 class Renderer(Protocol):
-    """What draws scenes: `osfcore.render.renderer.SceneRenderer`, or the paper's."""
+    """A renderer of scenes: `osfcore.render.renderer.SceneRenderer`, or the paper's."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -155,13 +167,13 @@ class Renderer(Protocol):
 def check_request(
     fields: Collection[str], batch: SceneBatch, cameras: Sequence[Camera], outputs: frozenset[str] | set[str]
 ) -> tuple[int, int]:
-    """Return height and width of the images [px], once everything asked for is found possible.
+    """Check a request to a renderer; return height and width of its images [px].
 
     Args:
-        fields: names of those there are.
+        fields: names of the fields that the renderer has.
         batch: scenes to render.
-        cameras: from which.
-        outputs: names of what is asked for.
+        cameras: cameras to render from.
+        outputs: names of the requested outputs.
 
     Raises:
         UnknownName: if an object has no field.
@@ -180,7 +192,7 @@ def check_request(
 
 
 def poses_of(batch: SceneBatch) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotations from the world into objects' frames (B, N, 3, 3) and positions (B, N, 3), the pusher last."""
+    """Return rotations from world to object frames (B, N, 3, 3) and positions (B, N, 3) [m], with the pusher last."""
     rotations = np.swapaxes(quaternion_to_matrix(batch.quaternions), -1, -2)
     positions = batch.positions
     if batch.pusher is not None:
@@ -191,7 +203,7 @@ def poses_of(batch: SceneBatch) -> tuple[np.ndarray, np.ndarray]:
 
 
 def camera_numbers(camera: Camera) -> Float[np.ndarray, "12"]:
-    """Return the position and the matrix from pixel coordinates to directions in the world."""
+    """Return a camera's position [m] and the 3 x 3 matrix from pixel coordinates to directions in the world."""
     pose = camera.T_world_camera
     matrix = quaternion_to_matrix(pose.quaternion) @ np.linalg.inv(camera.intrinsics)
     return np.concatenate([pose.position, matrix.reshape(-1)])

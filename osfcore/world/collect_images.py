@@ -61,7 +61,7 @@ class CollectObject:
         out: folder to write; must not exist or be empty.
         images: train and test images together; one in eight, at least 40, are for testing.
         size: side of the square images [px].
-        seed: of views and lights.
+        seed: seed of views and lights.
     """
 
     name: str
@@ -79,7 +79,7 @@ class CollectTable:
         out: folder to write; must not exist or be empty.
         images: train and test images together; one in eight, at least 40, are for testing.
         size: side of the square images [px].
-        seed: of views and lights.
+        seed: seed of views and lights.
     """
 
     out: Path
@@ -202,7 +202,7 @@ class CollectObservation:
         out: folder to write; must not exist or be empty.
         names: the objects, or None for a random choice.
         objects: how many objects, where `names` is None.
-        seed: of choice, scene and light.
+        seed: seed of choice, scene and light.
         size: side of the square images [px].
         goal: the goal camera's view alone, without pusher and masks.
     """

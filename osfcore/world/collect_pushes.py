@@ -60,9 +60,9 @@ def disturbed(episode: PushEpisode, models: Mapping[str, BodyModel], rng: np.ran
 
     Args:
         episode: recorded with poses within its actions.
-        models: of its objects.
+        models: models of its objects.
         rng: draws the disturbances.
-        count: of disturbances of each such state.
+        count: number of disturbances of each such state.
 
     Raises:
         InvalidInput: if the episode was recorded without poses within its actions.
@@ -267,9 +267,9 @@ class CollectPushes:
         steps: actions of 0.2 s per episode.
         objects: objects per scene, chosen at random among those fetched.
         policy: "paper" (uniform random velocities) or "directed" (seeks sustained contact).
-        seed: of everything.
+        seed: seed of everything.
         images: whether to keep frames of one camera as well, with the pusher.
-        renderer: of the frames.
+        renderer: renderer of the frames.
         names: objects to choose from; all of the library if None.
         disturb: from how many disturbed states to simulate each substep in which something moves.
         camera: that takes the frames.

@@ -58,7 +58,7 @@ class TableSurface:
     """The look of the table's top.
 
     Attributes:
-        albedo: of every point, linear; not used where there is a texture.
+        albedo: albedo of every point, linear; not used where there is a texture.
         texture: linear albedo in [0, 1], spread once over the table: its first row lies at the side of greatest y, its
             first column at that of least x. None for a table of one colour.
         levels: mip pyramid of the texture; empty if there is none.
@@ -111,7 +111,7 @@ def _trilinear(
     """Look up colours in [0, 1], interpolated between texels and between levels.
 
     Args:
-        levels: of a mip pyramid, of float32 or of 8 bits.
+        levels: levels of a mip pyramid, of float32 or of 8 bits.
         across: places from the left (0) to the right side (1) of the texture.
         down: places from the top (0) to the bottom (1).
         texels: side of the square that is averaged, in texels of the finest level.
@@ -167,7 +167,7 @@ def highlight(
 
     Args:
         normals: unit, toward the eye.
-        directions: of rays from the eye, of any length.
+        directions: directions of rays from the eye, of any length.
         light: unit vector toward the light.
         visible: 1 where the light arrives, 0 in shadow.
         lamp: its strength.
@@ -230,7 +230,7 @@ class TracedMesh:
         Args:
             faces: that were hit.
             barycentric: weights of each face's second and third corner.
-            directions: of the rays in the object's frame.
+            directions: directions of the rays in the object's frame.
 
         Returns:
             Smooth unit normals in the object's frame, toward the side that was hit; texture coordinates, v upwards.
@@ -348,8 +348,8 @@ class PixelSamples:
     """A grid of samples in each of some pixels.
 
     Attributes:
-        rows: of the pixels.
-        columns: of the pixels.
+        rows: rows of the pixels.
+        columns: columns of the pixels.
         points: pixel coordinates of the samples [px], those of one pixel after those of another.
     """
 
@@ -370,7 +370,7 @@ class Shot:
     """One view to trace.
 
     Attributes:
-        bodies: of the scene.
+        bodies: bodies of the scene.
         light: unit vector toward the light, float32.
         camera: the view.
         lamp: how strongly, and in which colour, the scene is lit.
@@ -476,7 +476,7 @@ def wooden_texture(rng: np.random.Generator, side: int = 1024) -> Float[np.ndarr
 
     Args:
         rng: draws the boards.
-        side: of the texture [texels].
+        side: side of the texture [texels].
     """
     edges = np.round(np.linspace(0, side, _ROWS + 1)).astype(int)
     shade = np.empty((side, side), np.float32)

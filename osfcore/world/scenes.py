@@ -1,4 +1,4 @@
-"""Scenes on request: which objects, their places at rest, light and conditions."""
+"""Random scenes: the choice of objects, their poses at rest, the light, and the conditions of the world."""
 
 from __future__ import annotations
 
@@ -24,14 +24,19 @@ MAX_HEIGHT_M = 1.0  # of an object's centre when it is put somewhere by hand
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneRequest:
-    """Contents of a random scene.
+    """Request for a random scene.
 
     Attributes:
-        names: the objects, or None for a random choice.
-        count: how many objects, where `names` is None.
-        light: the light, or None for a random one at least 10 deg above the table.
-        among: what to choose from, where `names` is None; all objects of the library if None.
-        is_upright: whether objects stand upright, as their meshes do, rather than in any resting orientation.
+        names: names of the objects; None to choose them at random.
+        count: number of objects to choose if `names` is None.
+        light: the light; None for a random one at least 10 deg above the table.
+        among: names to choose from if `names` is None; None for all objects of the library.
+        is_upright: whether objects stand upright, as in their meshes, instead of in any resting orientation.
+
+    Example:
+        >>> request = SceneRequest(names=("006_mustard_bottle",), is_upright=True)
+        >>> world = Tabletop(assets, request=request)
+        >>> world.close()
     """
 
     names: tuple[str, ...] | None = None
@@ -42,10 +47,13 @@ class SceneRequest:
 
 
 def check_request(library: AssetLibrary, request: SceneRequest) -> None:
-    """Check that a request can be met.
+    """Check that the library can fulfil a request.
 
     Raises:
-        UnknownName, MissingAssets, InvalidInput: if it cannot.
+        UnknownName: if there is no such object.
+        MissingAssets: if the mesh of an object has not been fetched.
+        InvalidInput: if there are too many objects, too few to choose from, or a name occurs twice.
+        OsfError: if the library is empty.
     """
     if request.names is not None:
         check_ranges(("number of objects", len(request.names), 1, MAX_OBJECTS))
@@ -103,7 +111,7 @@ def place_randomly(
 
     Args:
         physics: a simulation of these objects; it starts over.
-        assets: of the objects, by name.
+        assets: assets of the objects, by name.
         rng: draws poses and places.
         is_upright: objects stand upright, as their meshes do; one that falls over rests as it fell.
 
@@ -139,8 +147,8 @@ def refuse_overlaps(physics: Physics, names: tuple[str, ...], moved: str | None 
     """Raise if bodies penetrate by more than 2 mm.
 
     Args:
-        physics: of the bodies.
-        names: of the objects.
+        physics: physics of the bodies.
+        names: names of the objects.
         moved: check only pairs with this object; None for all.
 
     Raises:

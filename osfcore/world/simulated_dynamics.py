@@ -26,7 +26,7 @@ class SimulatedPushes:
     bodies are put back, so that a sequence may end a millimetre or two from where it ends alone.
 
     Args:
-        assets: of the objects, by name.
+        assets: assets of the objects, by name.
     """
 
     def __init__(self, assets: Mapping[str, ObjectAsset]) -> None:
@@ -42,7 +42,7 @@ class SimulatedPushes:
         """Simulate K sequences of T actions from a state in which everything is at rest.
 
         Args:
-            state: of exactly these objects, with its pusher.
+            state: state of exactly these objects, with its pusher.
             actions: velocities of the pusher [m/s].
             before: not used.
 

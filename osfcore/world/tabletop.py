@@ -1,7 +1,7 @@
 """The simulated tabletop: PyBullet moves the objects, ray tracing (or TinyRenderer) takes the pictures.
 
-It implements `osfcore.control.world.World`. Besides, it gives the true state, takes any view and moves objects by hand.
-Several may live in one process. Deterministic: the same seed gives the same bits.
+It implements `osfcore.control.world.World`. It also returns the true state, renders any view and moves objects by hand.
+One process can hold several. It is deterministic: the same seed gives exactly the same results.
 """
 
 from __future__ import annotations
@@ -41,21 +41,31 @@ _SETTLE_LIMIT_S = 3.0
 
 
 class Tabletop:
-    """A table, objects, a pusher, cameras and a light, simulated.
+    """A simulated table with objects, a pusher, cameras and a light.
 
     Args:
-        library: where the objects' meshes are.
-        cameras: what `observe` looks through.
-        request: what `reset` puts on the table.
-        executor: takes the views of an observation side by side, if given; threads serve.
-        conditions: lamp, table, contacts and what takes the pictures; the usual ones if None.
+        library: library of the objects' meshes.
+        cameras: cameras that `observe` uses; `default_cameras()` if None.
+        request: scene that `reset` arranges; three random objects if None.
+        executor: pool of threads that renders several views at once; None to render one after the other.
+        conditions: lamp, table, contacts and renderer; the usual ones if None.
 
     Attributes:
-        cameras: what `observe` looks through.
-        names: the objects on the table.
+        cameras: cameras that `observe` uses.
+        names: names of the objects on the table.
 
     Raises:
-        UnknownName, MissingAssets, InvalidInput: if the request cannot be met.
+        UnknownName: if the library has no such object.
+        MissingAssets: if the mesh of an object has not been fetched.
+        InvalidInput: if there are too many objects, too few to choose from, or a name occurs twice.
+
+    Example:
+        >>> world = Tabletop(assets, request=SceneRequest(names=("006_mustard_bottle",)))
+        >>> observation = world.reset(seed=0)
+        >>> world.act(np.array([0.1, 0.0, 0.0]))  # 0.1 m/s along x for 0.2 s
+        >>> bool((world.truth().pusher - observation.pusher)[0].round(3) == 0.02)
+        True
+        >>> world.close()
     """
 
     def __init__(
@@ -85,7 +95,7 @@ class Tabletop:
     # The World protocol
 
     def reset(self, seed: int) -> Observation:
-        """Arrange a new random scene at rest and observe it; the same for the same seed, request and objects.
+        """Arrange a random scene at rest and observe it. The same seed, request and objects give the same scene.
 
         Raises:
             NoRoom: if the objects do not fit side by side.
@@ -94,21 +104,21 @@ class Tabletop:
         return self.observe()
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """Take an image with every camera."""
+        """Take an image with every camera; with `masks`, the visible pixels of each object as well."""
         return self.render(self.cameras, masks=masks)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
-        """Hold the pusher velocity (vx, vy, 0) [m/s] for 0.2 s. The pusher stops at the border of its reach.
+        """Move the pusher with velocity (vx, vy, 0) in the world [m/s] for 0.2 s. It stops at the border of its reach.
 
         Raises:
-            InvalidInput: if the action is outside its limits; the world is unchanged.
+            InvalidInput: if vx or vy exceeds 0.3 m/s in size, or vz is not 0. The world is then unchanged.
         """
         velocity = check_action(action)
         for _ in range(SUBSTEPS):
             self._advance(velocity)
 
     def close(self) -> None:
-        """Free the simulation."""
+        """Release the simulation. Calling it again does nothing."""
         for simulation in (self._physics, self._tiny):
             if simulation is not None:
                 simulation.close()
@@ -118,12 +128,12 @@ class Tabletop:
 
     @property
     def assets(self) -> Mapping[str, ObjectAsset]:
-        """The objects on the table with their shapes."""
+        """The objects on the table with their meshes, by name."""
         return {name: self._asset(name) for name in self.names}
 
     @property
     def models(self) -> Mapping[str, BodyModel]:
-        """Masses and collision shapes of the objects on the table."""
+        """Masses and collision shapes of the objects on the table, by name."""
         return {name: self._models[name] for name in self.names}
 
     @property
@@ -138,7 +148,7 @@ class Tabletop:
         return self._physics
 
     def truth(self) -> SceneState:
-        """Return the true state, for drawing and evaluation; estimators must not see it."""
+        """Return the true state. It is for pictures and evaluation; estimators must not use it."""
         light = self._conditions.spot.distant if self._conditions.spot else self._light
         return SceneState(self.names, self._poses(), light, self._bodies.pusher)
 
@@ -163,12 +173,13 @@ class Tabletop:
         self._steps = 0
 
     def load(self, state: SceneState) -> None:
-        """Put exactly this state on the table, at rest; a state without pusher parks it at the reach's corner.
+        """Put exactly this state on the table, at rest. Without a pusher in the state, it is parked in a corner.
 
         Raises:
-            UnknownName, MissingAssets: if an object is not in the library.
+            UnknownName: if there is no such object.
+            MissingAssets: if the mesh of an object has not been fetched.
             InvalidInput: if an object is not over the table.
-            OverlappingObjects: if bodies penetrate by more than 2 mm; then the table is as before.
+            OverlappingObjects: if bodies penetrate by more than 2 mm. The table is then unchanged.
         """
         for name in state.names:
             self._library.check(name)
@@ -186,10 +197,12 @@ class Tabletop:
         self._steps = 0
 
     def load_measured(self, state: SceneState) -> None:
-        """Load measured poses: objects that sink into the table are lifted, those that overlap are moved apart.
+        """Load measured poses. Objects that sink into the table are lifted, and those that overlap are moved apart.
 
         Raises:
-            UnknownName, MissingAssets, InvalidInput: as `load`.
+            UnknownName: if there is no such object.
+            MissingAssets: if the mesh of an object has not been fetched.
+            InvalidInput: if an object is not over the table.
         """
         positions = np.maximum(state.poses.position, [-np.inf, -np.inf, 0.0])  # no centre below the table
         state = replace(state, poses=Pose(positions, state.poses.quaternion))
@@ -199,12 +212,13 @@ class Tabletop:
         move_apart(self._bodies, self.names)
 
     def restore(self, state: SceneState) -> None:
-        """Put back an earlier true state of a world.
+        """Put back an earlier true state of a world, at rest.
 
-        Unlike `load` it does not look for overlaps: contact may have left bodies a little inside each other.
+        Unlike `load`, it does not check for overlaps, because contact may leave bodies slightly inside each other.
 
         Raises:
-            UnknownName, MissingAssets: if an object is not in the library.
+            UnknownName: if there is no such object.
+            MissingAssets: if the mesh of an object has not been fetched.
         """
         for name in state.names:
             self._library.check(name)
@@ -212,10 +226,10 @@ class Tabletop:
         self._steps = 0
 
     def act_steps(self, action: Float[np.ndarray, "3"], rate_hz: float = 60.0) -> Iterator[SceneState]:
-        """Act, and yield the state about `rate_hz` times a second of simulated time; the last one is the end.
+        """Act as `act` does; yield the true state about `rate_hz` times per simulated second, and at the end.
 
         Raises:
-            InvalidInput: if the action is outside its limits; the world is unchanged.
+            InvalidInput: if the action is outside its limits. The world is then unchanged.
         """
         velocity = check_action(action)
         stride = _stride(rate_hz)
@@ -225,12 +239,18 @@ class Tabletop:
                 yield self.truth()
 
     def act_recorded(self, action: Float[np.ndarray, "3"], instants: int) -> tuple[frozenset[str], Pose]:
-        """Act; return the objects touched by the pusher, and all poses (instants, N) on the way.
+        """Act as `act` does, and record the motion.
 
-        The instants are equally spaced; the last one is the end of the action.
+        Args:
+            action: velocity (vx, vy, 0) of the pusher in the world [m/s].
+            instants: number of poses to record, at equal intervals. The last one is at the end of the action.
+
+        Returns:
+            Names of the objects that the pusher touched, and poses `T_world_object`, a batch of (instants, N).
 
         Raises:
-            InvalidInput: if the action is outside its limits or `instants` no divisor of 48; the world is unchanged.
+            InvalidInput: if the action is outside its limits, or `instants` does not divide 48. The world is then
+                unchanged.
         """
         velocity = check_action(action)
         if instants < 1 or SUBSTEPS % instants:
@@ -244,7 +264,7 @@ class Tabletop:
         return touched, Pose.stacked(poses)
 
     def settle(self, rate_hz: float = 60.0) -> Iterator[SceneState]:
-        """Let everything come to rest within 3 s, and yield the state on the way."""
+        """Simulate until everything rests, 3 s at most; yield the true state `rate_hz` times per simulated second."""
         stride = _stride(rate_hz)
         for step in range(1, round(_SETTLE_LIMIT_S / TIME_STEP_S) + 1):
             self._advance(np.zeros(3))
@@ -257,9 +277,9 @@ class Tabletop:
         """Put one object at rest at `T_world_object`.
 
         Raises:
-            UnknownName: if it is not on the table.
-            InvalidInput: if the pose is not finite, its quaternion not unit, or it is not over the table.
-            OverlappingObjects: if it would penetrate something by more than 2 mm; then nothing moved.
+            UnknownName: if the object is not on the table.
+            InvalidInput: if the pose is not finite or not over the table, or its quaternion is not unit.
+            OverlappingObjects: if it would penetrate something by more than 2 mm. Nothing is then moved.
         """
         check_known("object on the table", [name], self.names)
         position = finite_vector(pose.position, 3, f"position of {name} [m]")
@@ -275,24 +295,24 @@ class Tabletop:
             raise
 
     def gap_m(self, name: str) -> float:
-        """Return the gap to the nearest other object [m]: 0.05 if it is farther away, negative if they penetrate."""
+        """Return the gap to the nearest other object [m], 0.05 at most; negative if they penetrate each other."""
         others = [other for other in self.names if other != name]
         return min((self._bodies.distance(name, other) for other in others), default=0.05)
 
     def set_light(self, light: Light) -> None:
-        """Move the lamp."""
+        """Set the light of the scene."""
         self._light = light
 
     def render(self, cameras: tuple[Camera, ...], *, masks: bool = False, with_pusher: bool = True) -> Observation:
-        """Take images of the present state with any cameras.
+        """Take images of the present state with these cameras.
 
         Args:
-            cameras: of one image size.
-            masks: take the objects' masks as well.
-            with_pusher: draw the pusher.
+            cameras: cameras of one image size.
+            masks: whether to return the visible pixels of each object as well.
+            with_pusher: whether the images show the pusher.
 
         Raises:
-            InvalidInput: if there is no camera, or they differ in image size.
+            InvalidInput: if there is no camera, or the cameras differ in image size.
             OsfError: if the table is empty.
         """
         if len({(c.width, c.height) for c in cameras}) != 1:
@@ -310,7 +330,7 @@ class Tabletop:
     def pictures(
         self, cameras: tuple[Camera, ...], *, with_pusher: bool = True, with_objects: bool = True
     ) -> tuple[Picture, ...]:
-        """Take images with coverage and depth, for evaluation."""
+        """Take images with coverage and depth, for evaluation; with or without pusher and objects."""
         state = self.truth() if with_pusher else replace(self.truth(), pusher=None)
         if not with_objects:
             state = replace(state, names=(), poses=Pose(np.zeros((0, 3)), np.zeros((0, 4))))
@@ -348,11 +368,11 @@ class Tabletop:
 
 
 def _stride(rate_hz: float) -> int:
-    """Return how many time steps of physics lie between two states."""
+    """Return the number of physics steps between two states."""
     return max(round(1 / (rate_hz * TIME_STEP_S)), 1)
 
 
-# Worlds by name; other packages offer more (`osfcore.plugins`).
+# Worlds by name. Other packages can add more (`osfcore.plugins`).
 
 
 WORLD = PartKind("world", ("reset", "observe", "act", "close", "truth", "render"))
@@ -363,8 +383,8 @@ class WorldInputs:
     """Inputs of a factory of worlds.
 
     Attributes:
-        library: where the objects' meshes are.
-        request: what `reset` puts on the table.
+        library: library of the objects' meshes.
+        request: scene that `reset` arranges.
     """
 
     library: AssetLibrary

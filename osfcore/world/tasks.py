@@ -35,7 +35,7 @@ class Draw:
     Attributes:
         names: its objects.
         light: above the table.
-        seed: of the arrangement.
+        seed: seed of the arrangement.
     """
 
     names: tuple[str, ...]
@@ -56,9 +56,9 @@ def draw_scene(
     Args:
         available: objects to choose from, `count` or more.
         count: objects in the scene.
-        seed: of all the scenes.
+        seed: seed of all the scenes.
         number: which of them.
-        stream: of random numbers that they are drawn from.
+        stream: stream of random numbers that they are drawn from.
         min_elevation_deg: least elevation of their lights [deg].
     """
     rng = stream_rng(seed, stream, number)
@@ -105,7 +105,7 @@ def draw_goal(world: Tabletop, count: int, rng: np.random.Generator) -> tuple[Sc
 
     Args:
         world: with the objects where they start from.
-        count: of objects that move.
+        count: number of objects that move.
         rng: chooses them and their places.
     """
     start = world.truth()
@@ -146,16 +146,27 @@ def _put(world: Tabletop, name: str, pose: Pose) -> bool:
 
 
 def random_goal(world: Tabletop, seed: int, moved: int | None) -> tuple[SceneState, tuple[str, ...]]:
-    """Draw a random layout with some objects elsewhere; return it and which moved. The world is left like that.
+    """Move some objects of a simulated table to random places, to make a goal. The world stays in the goal state.
 
     Args:
-        world: with the objects where they start from.
-        seed: of everything random.
-        moved: how many objects move; None for a random number.
+        world: world with the objects at their start.
+        seed: seed of everything random.
+        moved: number of objects that move; None for a random number.
+
+    Returns:
+        The goal state, and the names of the objects that moved.
 
     Raises:
         InvalidInput: if `moved` is not between 1 and the number of objects.
-        NoRoom: if no layout has room.
+        NoRoom: if no layout without overlaps was found.
+
+    Example:
+        >>> world = Tabletop(assets, request=SceneRequest(names=(name,)))
+        >>> world.arrange(seed=0)
+        >>> goal_state, moved = random_goal(world, seed=1, moved=1)
+        >>> moved
+        ('006_mustard_bottle',)
+        >>> world.close()
     """
     start = world.truth()
     if moved is not None:
@@ -177,7 +188,7 @@ def arranged_goal(world: Tabletop, poses: Mapping[str, Pose], *, is_measured: bo
 
     Args:
         world: with the objects.
-        poses: of some of them.
+        poses: poses of some of them.
         is_measured: the poses may err: objects that penetrate are moved apart first.
 
     Raises:
@@ -235,7 +246,7 @@ class TaskSet:
         available: objects to choose from.
         family: what their goals ask for.
         objects: in each scene.
-        seed: of all of them.
+        seed: seed of all of them.
     """
 
     available: tuple[str, ...]
@@ -278,7 +289,7 @@ def draw_task(library: AssetLibrary, tasks: TaskSet, number: int) -> DrawnTask:
     Args:
         library: meshes of the objects.
         tasks: the set.
-        number: of the task, from 0.
+        number: number of the task, from 0.
 
     Raises:
         InvalidInput: as `check_tasks`.
@@ -314,9 +325,9 @@ def _lay_out(
 
     Args:
         world: with all objects where they start from.
-        family: of the task.
-        names: of the objects, those that move first.
-        number: of the task: kinds of goals take turns.
+        family: family of the task.
+        names: names of the objects, those that move first.
+        number: number of the task: kinds of goals take turns.
         rng: draws places and turns.
     """
     kind = number % min(len(names), 3)

@@ -1,4 +1,4 @@
-"""Robots by address."""
+"""Connections to robots by address."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ def connect(url: str, names: tuple[str, ...] = (), limits: SafetyLimits | None =
     """Connect to the robot at an address.
 
     Args:
-        url: of a robot over HTTP, or of rosbridge with the names of ROS in its query (`RosNames`).
-        names: of the objects on the table.
-        limits: of a robot under ROS, which has no message for them; the usual ones if None.
+        url: address of a robot over HTTP, or of rosbridge with the names of ROS in its query (`RosNames`).
+        names: names of the objects on the table.
+        limits: limits of a robot under ROS, which has no message for them; the usual ones if None.
 
     Raises:
         InvalidInput, UnknownName: if the address is malformed.
         MissingExtra: if a package for ROS is not installed.
-        ConnectionLost: if nobody answers.
-        RobotRefused: if what answers is no robot.
+        ConnectionLost: if there is no answer.
+        RobotRefused: if the answer does not come from a robot.
     """
     parts = check_address(url)
     host, port = parts.hostname or "", parts.port

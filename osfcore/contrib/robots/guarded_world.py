@@ -1,4 +1,4 @@
-"""A world whose pusher stays within limits, asks before its first motion, and can be stopped at any time."""
+"""A world that keeps its pusher within limits, asks before the first motion, and can be stopped at any time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from osfcore.photo.segmentation import Box, propose_masks
 
 _OUTSIDE_M = 0.01  # a pusher may have come so far outside the box by itself, and returns
 
-# How far what a robot says of its pusher may differ from what was asked of it.
+# How far the reported position of the pusher may differ from the commanded one.
 _PLACE_ERROR_M = 0.01  # of a measured place: calibration, and the give of an arm that pushes
 _OVERSHOT_SHARE = 0.5  # of a motion: a controller may go on for 0.1 s after each 0.2 s
 _FELT_M = 0.005  # shorter motions say nothing of whether it moves: a measured place trembles
@@ -32,11 +32,11 @@ _HELD_M = 0.1  # of motions in a row of which less was done: an object may hold 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HeldBack:
-    """An action that a wall of the box cut short.
+    """An action that was shortened at a wall of the safety box.
 
     Attributes:
-        action: as asked for [m/s].
-        done: the part that was done, as a velocity held for as long [m/s].
+        action: the commanded velocity [m/s].
+        done: the executed part, as a velocity held for the same time [m/s].
     """
 
     action: Float[np.ndarray, "3"]
@@ -46,19 +46,20 @@ class HeldBack:
 class GuardedWorld:
     """A wrapper of any `World` that enforces limits.
 
-    An action above the top speed is done slower, for longer, along the same path. A path out of the box ends at its
-    wall. Between two observations the pusher may be wherever its actions can have brought it; no such place is outside.
+    An action above the top speed is executed more slowly, for a longer time, along the same path. A path out of the box
+    ends at its wall. All places that the pusher can have reached between two observations are inside the box.
 
-    Each place that the robot says is compared with what was asked since the one before. A pusher that is where no part
-    of its actions leads is stopped. One that does less than a third may be held by an object, or its place may not be
-    measured at all: until it is seen to move, it counts as being anywhere between, and after 10 cm it is stopped.
+    Each position that the robot reports is compared with the commands since the last one. The robot is stopped if its
+    pusher is where no part of the commands leads. If the pusher has moved less than a third of the commanded way, an
+    object may hold it, or its position may not be measured. It then counts as being anywhere on the way until it is
+    seen to move. It is stopped after 10 cm.
 
-    `stop`, `close` and any error while the robot looks or moves stop it. After that `act` only raises `RobotStopped`.
+    `stop`, `close`, and any error of the robot stop it. After that, `act` raises `RobotStopped`.
 
     Args:
-        world: that is moved; started and stopped if it is `Stoppable`.
-        limits: for the pusher.
-        permit: asked once, before the first motion; nothing moves unless it returns True.
+        world: the world to guard. It is started and stopped if it is `Stoppable`.
+        limits: limits of the pusher.
+        permit: function that is called once before the first motion. Nothing moves unless it returns True.
     """
 
     def __init__(self, world: World, limits: SafetyLimits, permit: Callable[[], bool] | None = None) -> None:
@@ -76,20 +77,20 @@ class GuardedWorld:
 
     @property
     def held_back(self) -> tuple[HeldBack, ...]:
-        """Actions that were cut short so far."""
+        """Actions that were shortened so far."""
         return tuple(self._held_back)
 
     def check(self) -> None:
-        """Raise if the robot was stopped.
+        """Check that the robot was not stopped.
 
         Raises:
-            RobotStopped: if so.
+            RobotStopped: if it was.
         """
         if self._stopped.is_set():
             raise RobotStopped(self._reason)
 
     def stop(self, reason: str) -> None:
-        """Stop the robot for good; from any thread, any number of times.
+        """Stop the robot for good. Any thread may call this, any number of times.
 
         Args:
             reason: why, as the end of the sentence "The robot was stopped: ...".
@@ -102,7 +103,7 @@ class GuardedWorld:
     # The World protocol
 
     def reset(self, seed: int) -> Observation:
-        """Reset the wrapped world; a robot only observes, so its pusher is compared as in `observe`."""
+        """Reset the wrapped world. A robot only observes; its pusher is checked as in `observe`."""
         with self._halted_by_errors():
             seen = self._world.reset(seed)
         if isinstance(self._world, Stoppable):
@@ -112,10 +113,10 @@ class GuardedWorld:
         return seen
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """Observe the wrapped world; also after a stop.
+        """Observe the wrapped world. This works after a stop as well.
 
         Raises:
-            RobotStopped: if the pusher is not where its actions lead.
+            RobotStopped: if the pusher is not where its commands lead.
         """
         with self._halted_by_errors():
             seen = self._world.observe(masks=masks)
@@ -123,21 +124,22 @@ class GuardedWorld:
         return seen
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
-        """Do as much of an action as the limits allow.
+        """Execute as much of an action as the limits allow.
 
         Raises:
-            InvalidInput: if it is no action, or the pusher's place is unknown or well outside the box; nothing moves.
-            RobotStopped: if the robot was stopped, before or meanwhile, or may not move.
+            InvalidInput: if it is no action, or the pusher's position is unknown or well outside the box. Nothing
+                moves.
+            RobotStopped: if the robot was stopped before or during the action, or may not move.
         """
         action = check_action(action)
         wanted = action[:2] * STEP_S
         self.check()
         where = self._where
         if where is None:
-            raise InvalidInput("place of the pusher", "unknown", "said by the robot before it is moved")
+            raise InvalidInput("position of the pusher", "unknown", "reported by the robot before it moves")
         if self._limits.outside_m(where) > _OUTSIDE_M:
-            allowed = f"within {self._limits.box}, the safety box; move it there by hand, or allow a larger box"
-            raise InvalidInput("place of the pusher [m]", np.round(where.low, 3).tolist(), allowed)
+            allowed = f"within {self._limits.box}, the safety box; move the pusher there by hand, or allow a larger box"
+            raise InvalidInput("position of the pusher [m]", np.round(where.low, 3).tolist(), allowed)
         travel = self._limits.allowed_travel(wanted, where)
         if not np.allclose(travel, wanted, atol=1e-6):
             self._held_back.append(HeldBack(action, np.array([*(travel / STEP_S), 0.0])))
@@ -154,11 +156,11 @@ class GuardedWorld:
     def close(self) -> None:
         """Stop the robot and release what the wrapped world holds."""
         if self._is_started:
-            self.stop("it was let go")
+            self.stop("the connection was closed")
         self._world.close()
 
     def _locate(self, pusher: Float[np.ndarray, "3"] | None) -> None:
-        """Take the pusher to be where the robot says."""
+        """Set the pusher's position to the one that the robot reports."""
         self._where, self._unmoved_m = None if pusher is None else Whereabouts.at(pusher), 0.0
         if pusher is not None:
             self._compare_from(pusher)
@@ -168,7 +170,7 @@ class GuardedWorld:
         self._asked = self._wished = np.zeros(2)
 
     def _take_place(self, pusher: Float[np.ndarray, "3"] | None) -> None:
-        """Compare the place that the robot says with what was asked; stop the robot if they contradict each other.
+        """Compare the reported position with the commands; stop the robot if they contradict each other.
 
         Raises:
             RobotStopped: if they do.
@@ -179,8 +181,8 @@ class GuardedWorld:
             return
         off_m = where.distance_m(pusher[:2])
         if off_m > _PLACE_ERROR_M + _OVERSHOT_SHARE * self._way_m:
-            off = f"its pusher is {1000 * off_m:.0f} mm away from where it was asked to go"
-            self.stop(f"{off}; see whether something moved it, and whether places and velocities have the same axes")
+            off = f"its pusher is {1000 * off_m:.0f} mm away from its commanded path"
+            self.stop(f"{off}; check whether something moved it, and whether positions and velocities share axes")
             self.check()
         asked_m, wished_m = float(np.linalg.norm(self._asked)), float(np.linalg.norm(self._wished))
         if max(asked_m, wished_m) < _FELT_M:  # wait for more
@@ -190,11 +192,11 @@ class GuardedWorld:
         if asked_m >= _FELT_M and moved_m >= _LEAST_SHARE * asked_m:
             self._locate(pusher)
             return
-        # A wall that it may have reached unseen ends its way: then the wish alone is left, and counts.
+        # It may have reached a wall unseen and stopped there. Then only the wished travel is left to compare.
         self._where, self._unmoved_m = where.with_place(pusher[:2]), self._unmoved_m + max(asked_m, wished_m)
         if self._unmoved_m > _HELD_M:
-            unmoved = f"its pusher was asked to go {1000 * self._unmoved_m:.0f} mm, and hardly moved by what it says"
-            self.stop(f"{unmoved}; see whether something holds it, and whether its place is measured")
+            unmoved = f"its pusher hardly moved although it was commanded {1000 * self._unmoved_m:.0f} mm"
+            self.stop(f"{unmoved}; check whether something holds it, and whether its position is measured")
             self.check()
         self._compare_from(pusher)
 
@@ -214,7 +216,7 @@ class GuardedWorld:
 
     @contextlib.contextmanager
     def _halted_by_errors(self) -> Iterator[None]:
-        """Stop the robot on any error, also on an interruption by the keyboard."""
+        """Stop the robot on any error, including an interruption by the keyboard."""
         try:
             yield
         except BaseException as error:
@@ -231,7 +233,7 @@ class GuardedWorld:
                 self._world.stop()
 
 
-# Masks of the first observation for worlds without: a person draws a box around each object, GrabCut its outline.
+# Masks of the first observation for worlds without masks: a person draws a box around each object; GrabCut segments it.
 
 CameraBoxes = Mapping[str, Mapping[str, Box]]
 
@@ -240,9 +242,10 @@ class OutlinedWorld:
     """A wrapper of a world without masks, which takes them from boxes.
 
     Args:
-        world: that looks and moves.
-        boxes: by names of camera and object, x0, y0, x1, y1 [px] of the images of `observe`. Cameras in which an object
-            has none are left out of observations with masks: no mask would mean that it is not visible there.
+        world: the wrapped world.
+        boxes: boxes (x0, y0, x1, y1) [px] in the images of `observe`, by names of camera and object. A camera without a
+            box for each object is left out of observations with masks, since a missing mask would mean that the object
+            is not visible.
     """
 
     def __init__(self, world: World, boxes: CameraBoxes) -> None:
@@ -250,11 +253,11 @@ class OutlinedWorld:
         self.reset, self.act, self.close = world.reset, world.act, world.close
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """Observe the wrapped world, with outlines on demand.
+        """Observe the wrapped world; with `masks`, segment the objects in their boxes.
 
         Raises:
-            UnknownName: if a box is in no camera, or around no object, that there is.
-            InvalidInput: if no camera has a box around each object, or nothing is found in one.
+            UnknownName: if a box names a camera or an object that does not exist.
+            InvalidInput: if no camera has a box around each object, or nothing is found in a box.
         """
         seen = self._world.observe(masks=masks)
         if not masks or seen.masks is not None:

@@ -1,4 +1,4 @@
-"""A robot that speaks HTTP: JSON and picture files, as docs/how-to/robots.md describes."""
+"""A robot over HTTP, with JSON and image files as docs/how-to/robots.md describes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from osfcore.io.scene_file import CameraJson, PointJson, rigid_pose
 from osfcore.photo.read_photograph import KEPT_SIDE as MOST_SIDE
 from osfcore.photo.read_photograph import read_photograph
 
-# From encoded pictures of a robot's cameras to linear radiance of moderate size, as an `Observation` holds it.
+# Encoded images of a robot's cameras become linear radiance of moderate size, as in an `Observation`.
 
 KEPT_SIDE = 640  # larger pictures are reduced to this; estimates look at less
 HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV and ROS have pixel centres at whole numbers
@@ -46,14 +46,14 @@ _DETAIL_CHARACTERS = 300  # of a robot's reason for a refusal
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SentCamera:
-    """A camera as a robot describes it: of any image size.
+    """A camera as a robot describes it, with images of any size.
 
     Attributes:
-        name: of the camera.
-        T_world_camera: its pose over the table.
+        name: name of the camera.
+        T_world_camera: pose of the camera over the table.
         intrinsics: K of the pictures that are sent, pixel centres at +0.5 [px].
-        width: of the pictures that are sent [px].
-        height: of the pictures that are sent [px].
+        width: width of the pictures that are sent [px].
+        height: height of the pictures that are sent [px].
         distortion: coefficients of OpenCV's model; none for a pinhole camera.
     """
 
@@ -102,7 +102,7 @@ class SentCamera:
         if image.shape[:2] != (self.height, self.width):
             what = f"picture of camera {shown(self.name)} [px]"
             given = f"{image.shape[1]} x {image.shape[0]}"
-            raise InvalidInput(what, given, f"{self.width} x {self.height}, as the robot says")
+            raise InvalidInput(what, given, f"{self.width} x {self.height}, as the robot describes it")
         if any(self.distortion):
             image = cv2.undistort(image, self.intrinsics - HALF_PIXEL, np.array(self.distortion))
         kept = self.kept()
@@ -121,12 +121,12 @@ def observation_of(
     """Decode all that a robot sent into an observation.
 
     Args:
-        cameras: that took the pictures.
-        pictures: one file of each camera.
-        names: of the objects, given by the owner.
-        pusher: its centre [m].
-        time_s: since the robot was connected [s].
-        masks: files by names of camera and object; objects without a file are not visible. None without masks.
+        cameras: cameras that took the images.
+        pictures: one image file of each camera.
+        names: names of the objects, given by the owner.
+        pusher: centre of the pusher in the world [m].
+        time_s: time since the robot was connected [s].
+        masks: mask files by names of camera and object; an object without a file is not visible. None for no masks.
 
     Raises:
         CorruptFile: if a file is no picture.
@@ -148,7 +148,7 @@ def observation_of(
 
 
 class LimitsJson(Entry):
-    """Limits that a robot keeps by itself."""
+    """Limits that a robot enforces itself."""
 
     box: Vector4 = Field(description="x0, y0, x1, y1 of the pusher's centre [m].")
     top_speed_m_s: FiniteFloat
@@ -165,23 +165,23 @@ class RobotJson(Entry):
 
 
 class HttpRobot:
-    """A `Robot` over HTTP; `description` is what it says of itself.
+    """A `Robot` over HTTP. `description` is its own description.
 
     Args:
-        url: its address, such as http://192.168.0.7:8080.
-        names: of the objects on the table, given by a person.
-        timeout_s: how long an answer may take, to its last byte and beyond the time that a motion takes [s].
+        url: address of the robot, such as http://192.168.0.7:8080.
+        names: names of the objects on the table, given by a person.
+        timeout_s: longest time for a complete answer, in addition to the time of a motion [s].
 
     Raises:
-        ConnectionLost: if nobody answers.
-        RobotRefused: if something else than a robot answers.
+        ConnectionLost: if there is no answer.
+        RobotRefused: if the answer does not come from a robot.
         InvalidInput: if its description is out of range.
     """
 
     def __init__(self, url: str, names: tuple[str, ...], timeout_s: float = ANSWER_S) -> None:
         self._url, self._names, self._timeout_s = url.rstrip("/"), names, timeout_s
-        # Timeouts of a synchronous client begin anew with every byte, so whoever sends few of them holds it for ever.
-        # Requests run in an event loop instead, where a time limits each as a whole.
+        # Timeouts of a synchronous client restart with every byte, so that a slow sender could hold it for ever.
+        # Requests run in an event loop instead, which limits the time of each request as a whole.
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="robot over HTTP", daemon=True)
         self._thread.start()
@@ -208,7 +208,7 @@ class HttpRobot:
         self._began = time.monotonic()
 
     def reset(self, seed: int) -> Observation:
-        """Observe: a person arranges the table."""
+        """Only observe, because a person arranges the table."""
         return self.observe()
 
     def observe(self, *, masks: bool = False) -> Observation:
@@ -240,7 +240,7 @@ class HttpRobot:
         return tuple(self._answer("GET", path, most=MOST_PICTURE_BYTES) for path in paths)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
-        """Hold a velocity for 0.2 s; the robot answers when that is over.
+        """Hold a velocity for 0.2 s. The robot answers when the motion is over.
 
         Raises:
             InvalidInput: if it is no action.
@@ -251,11 +251,11 @@ class HttpRobot:
         self._answer("POST", "act", {"velocity": velocity, "duration_s": STEP_S}, takes_s=STEP_S)
 
     def start(self) -> None:
-        """Make ready to move."""
+        """Prepare the robot to move."""
         self._answer("POST", "start")
 
     def stop(self) -> None:
-        """Halt at once; from any thread, for a client has as many connections as it needs."""
+        """Halt at once. Any thread may call this."""
         self._answer("POST", "stop")
 
     def close(self) -> None:
@@ -279,7 +279,7 @@ class HttpRobot:
         except OsfError:  # a ValueError itself
             raise
         except ValueError:
-            raise RobotRefused(self._url, f"something that is no JSON to GET /{path}") from None
+            raise RobotRefused(self._url, f"its answer to GET /{path} is not JSON") from None
 
     def _answer(
         self, method: str, path: str, body: object = None, *, most: int = MOST_JSON_BYTES, takes_s: float = 0.0
@@ -287,19 +287,19 @@ class HttpRobot:
         """Send a request and wait for the answer.
 
         Args:
-            method: of HTTP.
-            path: below the robot's address.
-            body: what is sent as JSON.
-            most: bytes of the answer.
-            takes_s: what the robot needs for what is asked of it [s].
+            method: HTTP method.
+            path: path below the robot's address.
+            body: body of the request, sent as JSON.
+            most: largest size of the answer [bytes].
+            takes_s: time that the robot needs for the requested motion [s].
 
         Raises:
-            ConnectionLost: if there is no whole answer in time.
-            RobotRefused: if the robot refuses, or says too much.
+            ConnectionLost: if there is no complete answer in time.
+            RobotRefused: if the robot refuses, or its answer is too large.
         """
         with self._idle:
             if self._is_closed:
-                raise ConnectionLost(self._url, "it was let go")
+                raise ConnectionLost(self._url, "the connection was closed")
             self._under_way += 1
         seconds = self._timeout_s + takes_s
         asked = asyncio.run_coroutine_threadsafe(self._ask(method, path, body, most, seconds), self._loop)
@@ -317,19 +317,19 @@ class HttpRobot:
                 self._under_way -= 1
                 self._idle.notify_all()
         if not 200 <= status < 300:
-            raise RobotRefused(self._url, _detail(content) or f"{status} to {method} /{path}")
+            raise RobotRefused(self._url, _detail(content) or f"status {status} in answer to {method} /{path}")
         return content
 
     async def _ask(self, method: str, path: str, body: object, most: int, seconds: float) -> tuple[int, bytes]:
-        """Return an answer's status and its content, as it is sent."""
+        """Return the status and the raw content of an answer."""
         url, content = f"{self._url}/{path}", bytearray()
         async with asyncio.timeout(seconds), self._http.stream(method, url, json=body) as answer:
             if answer.headers.get("Content-Encoding", "identity") != "identity":
-                raise RobotRefused(self._url, f"something compressed to {method} /{path}, which was not asked for")
+                raise RobotRefused(self._url, f"its answer to {method} /{path} is compressed; send it uncompressed")
             async for chunk in answer.aiter_raw():
                 content += chunk
                 if len(content) > most:
-                    raise RobotRefused(self._url, f"more than {most // 1_000_000} MB to {method} /{path}")
+                    raise RobotRefused(self._url, f"its answer to {method} /{path} exceeds {most // 1_000_000} MB")
             return answer.status_code, bytes(content)
 
 

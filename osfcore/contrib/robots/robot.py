@@ -27,7 +27,7 @@ class SafetyLimits:
 
     Attributes:
         box: x0, y0, x1, y1 [m].
-        top_speed_m_s: of the pusher, in any direction [m/s].
+        top_speed_m_s: top speed of the pusher, in any direction [m/s].
     """
 
     box: tuple[float, float, float, float] = (-PUSHER_REACH_M, -PUSHER_REACH_M, PUSHER_REACH_M, PUSHER_REACH_M)
@@ -46,7 +46,7 @@ class SafetyLimits:
         object.__setattr__(self, "box", (x0, y0, x1, y1))
 
     def within(self, other: SafetyLimits) -> SafetyLimits:
-        """Combine two limits: the common part of the boxes, and the lower speed.
+        """Return the common part of two boxes, with the lower speed.
 
         Raises:
             InvalidInput: if the boxes have nothing in common.
@@ -63,15 +63,15 @@ class SafetyLimits:
         return float(max(0.0, (low - where.low).max(), (where.high - high).max()))
 
     def allowed_travel(self, travel: Float[np.ndarray, "2"], where: Whereabouts) -> Float[np.ndarray, "2"]:
-        """Clip a travel to the box: it ends at a wall, and goes on along it.
+        """Clip a travel to the box: it ends at a wall and continues along it.
 
         Per axis, as the simulated pusher stops at the border of its reach:
 
             min(t, high - where.high) >= 0 for t > 0, max(t, low - where.low) <= 0 for t < 0.
 
         Args:
-            travel: of the pusher [m].
-            where: the pusher is.
+            travel: travel of the pusher [m].
+            where: rectangle that holds the pusher.
         """
         low, high = np.reshape(self.box, (2, 2))
         most, least = np.maximum(high - where.high, 0), np.minimum(low - where.low, 0)
@@ -80,7 +80,7 @@ class SafetyLimits:
     def slow_parts(self, travel: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "3"]]:
         """Split a travel [m] into allowed velocities (vx, vy, 0) [m/s], each held for `STEP_S`.
 
-        Pushes are so slow that only the path counts. So predictions of the action also hold for slower, longer parts.
+        Pushes are quasi-static, so that only the path counts. Predictions of an action also hold for slower parts.
         """
         speed = float(np.linalg.norm(travel)) / STEP_S
         count = max(1, int(np.ceil(speed / self.top_speed_m_s - 1e-9)))
@@ -89,11 +89,11 @@ class SafetyLimits:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Whereabouts:
-    """A rectangle that holds the pusher's centre, however much of its commands it has done.
+    """A rectangle that holds the pusher's centre, whatever part of its commands it has executed.
 
     Attributes:
         low: least x and y [m].
-        high: largest [m].
+        high: largest x and y [m].
     """
 
     low: Float[np.ndarray, "2"]
@@ -101,7 +101,7 @@ class Whereabouts:
 
     @staticmethod
     def at(position: Float[np.ndarray, "*xyz"]) -> Whereabouts:
-        """Return the point where the pusher was measured, of x, y and perhaps z [m]."""
+        """Return the point at which the pusher was measured; `pusher` is x, y and optionally z [m]."""
         return Whereabouts(position[:2].astype(float), position[:2].astype(float))
 
     def distance_m(self, place: Float[np.ndarray, "2"]) -> float:
@@ -113,11 +113,12 @@ class Whereabouts:
         return Whereabouts(np.minimum(self.low, place), np.maximum(self.high, place))
 
     def after(self, travel: Float[np.ndarray, "2"]) -> Whereabouts:
-        """Extend the rectangle by a travel [m], any share of which may have been done: objects may hold the pusher."""
+        """Extend the rectangle by a travel [m], of which only a part may be done, since objects may hold the pusher."""
         return Whereabouts(self.low + np.minimum(travel, 0), self.high + np.maximum(travel, 0))
 
 
-# What a robot may say, over HTTP and rosbridge alike. It may be broken, or no robot: whatever answers is not trusted.
+# Checks of a robot's answers, over HTTP and rosbridge. Answers are not trusted: they may come from a broken robot or
+# none.
 
 ANSWER_S = 5.0  # from a question to the last byte of its answer
 MOST_PICTURE_BYTES = 32_000_000  # a PNG of 2048 x 2048 pixels of 16 bits has 25 million
@@ -128,7 +129,7 @@ _TEXT = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"', re.DOTALL)
 
 
 def parse_json(content: str | bytes) -> Any:  # noqa: ANN401
-    """Parse JSON that takes neither much memory nor a deep stack, whatever it holds.
+    """Parse JSON with limits on its size and depth.
 
     Raises:
         ValueError: if it is malformed, too large or nested too deeply.
@@ -145,13 +146,13 @@ def parse_json(content: str | bytes) -> Any:  # noqa: ANN401
     return json.loads(text)
 
 
-# What a robot offers besides a `World`: start and stop, a description, errors.
+# Parts of a robot in addition to a `World`: start and stop, a description, errors.
 
 LONGEST_DEADMAN_S = 1.0
 
 
 class RobotStopped(OsfError):
-    """The robot was stopped; it moves no more.
+    """The robot was stopped and does not move any more.
 
     Args:
         reason: why, as the end of a sentence.
@@ -163,29 +164,29 @@ class RobotStopped(OsfError):
 
 
 class ConnectionLost(OsfError):
-    """A robot that no longer answers; it halts by itself.
+    """The robot does not answer any more. It halts by itself.
 
     Args:
-        url: of the robot.
+        url: address of the robot.
         reason: what happened.
     """
 
     def __init__(self, url: str, reason: str) -> None:
         lost = f"The robot at {url} does not answer ({reason.rstrip('.')})"
-        super().__init__(f"{lost}; if it moved, it halts by itself. See whether it runs and is on the network.")
+        super().__init__(f"{lost}; if it moved, it halts by itself. Check whether it runs and is on the network.")
         self.url, self.reason = url, reason
 
 
 class RobotRefused(OsfError):
-    """A robot's answer to a request that it refuses, or an answer that cannot be read.
+    """The robot refused a request, or its answer cannot be used.
 
     Args:
-        url: of the robot.
-        reason: a sentence.
+        url: address of the robot.
+        reason: why, as the end of a sentence.
     """
 
     def __init__(self, url: str, reason: str) -> None:
-        super().__init__(f"The robot at {url} says: {reason.rstrip('.')}.")
+        super().__init__(f"The robot at {url} refused or failed: {reason.rstrip('.')}.")
         self.url, self.reason = url, reason
 
 
@@ -194,11 +195,11 @@ class RobotDescription:
     """A robot's description of itself.
 
     Attributes:
-        cameras: with their poses over the table.
-        limits: that it keeps by itself.
-        pusher_radius_m: of its pusher, a vertical cylinder [m].
-        deadman_s: without a new command it halts after this time [s].
-        masks: objects whose masks it delivers.
+        cameras: cameras with their poses over the table.
+        limits: limits that it enforces itself.
+        pusher_radius_m: radius of its pusher, a vertical cylinder [m].
+        deadman_s: time without a new command after which it halts [s].
+        masks: names of the objects whose masks it can send.
     """
 
     cameras: tuple[Camera, ...]
@@ -226,16 +227,16 @@ class Stoppable(Protocol):
     """Something that moves by itself and can be stopped."""
 
     def start(self) -> None:
-        """Make ready to move, after a stop or for the first time; nothing moves yet."""
+        """Prepare to move, for the first time or after a stop. Nothing moves yet."""
         ...
 
     def stop(self) -> None:
-        """Halt at once until `start`; from any thread, also while another one waits in `act`."""
+        """Halt at once until `start`. Any thread may call this, even while another one waits in `act`."""
         ...
 
 
 class Robot(World, Stoppable, Protocol):
-    """A real world: `reset` only observes, for a person arranges the table."""
+    """A real world. Its `reset` only observes, because a person arranges the table."""
 
     @property
     def description(self) -> RobotDescription:
@@ -243,5 +244,5 @@ class Robot(World, Stoppable, Protocol):
         ...
 
     def pictures(self) -> tuple[bytes, ...]:
-        """Take a picture file with each camera, for `read_photograph`; also while another thread uses the robot."""
+        """Return an image file of each camera, for `read_photograph`. Another thread may use the robot meanwhile."""
         ...

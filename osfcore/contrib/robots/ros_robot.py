@@ -1,4 +1,4 @@
-"""A robot under ROS 2 through rosbridge, without ROS here: compressed images, camera_info and tf in, twists out."""
+"""A robot under ROS 2 through rosbridge, without ROS here: it sends images, camera_info and tf, and receives twists."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class TransformTree:
     """The frames of ROS by `T_parent_child`; later messages replace earlier ones.
 
     Args:
-        messages: of /tf and /tf_static, the older first.
+        messages: messages of /tf and /tf_static, the older first.
 
     Raises:
         InvalidInput: if a message is malformed.
@@ -119,7 +119,7 @@ def _plain(frame: str) -> str:
 # The part of rosbridge's protocol (v2.0, JSON over a websocket) that a robot needs: subscribe, advertise, publish.
 #
 # roslibpy speaks all of it, but through the reactor of Twisted, of which a process has one that cannot be started
-# twice: a lost connection could not be opened anew, nor closed without leaving its threads.
+# twice: a lost connection could not be reopened, nor closed without leaving its threads.
 
 _MOST_BYTES = MOST_PICTURE_BYTES * 4 // 3 + MOST_JSON_BYTES  # of a message: pictures come in base64
 
@@ -128,7 +128,7 @@ class Rosbridge:
     """One connection, with a thread that receives messages.
 
     Args:
-        url: of rosbridge's websocket, ws://host:port.
+        url: address of rosbridge's websocket, ws://host:port.
         timeout_s: how long opening and closing may take [s].
 
     Raises:
@@ -157,7 +157,7 @@ class Rosbridge:
 
         Args:
             topic: its name.
-            kind: of its messages, such as sensor_msgs/msg/CameraInfo.
+            kind: type of its messages, such as sensor_msgs/msg/CameraInfo.
             every_ms: least time between two messages [ms].
             kept: how many of the last messages are kept, if they are not too large together.
         """
@@ -282,10 +282,10 @@ class RosNames:
     pusher: str = "pusher"
 
     def __post_init__(self) -> None:
-        """Check that there are cameras, each of another name.
+        """Check that there are cameras with different names.
 
         Raises:
-            InvalidInput: if not.
+            InvalidInput: if there are none, or two have the same name.
         """
         if not self.cameras or not all(self.cameras):
             given = ", ".join(self.cameras) or "missing"
@@ -313,10 +313,10 @@ class RosRobot:
     """A `Robot` under ROS; `description` has the cameras that ROS publishes, and the limits that were given.
 
     Args:
-        url: of rosbridge's websocket, ws://host:9090.
-        topics: and frames.
-        names: of the objects on the table, given by a person.
-        limits: of this robot, for which ROS has no message.
+        url: address of rosbridge's websocket, ws://host:9090.
+        topics: names of topics and frames.
+        names: names of the objects on the table, given by a person.
+        limits: limits of this robot, for which ROS has no message.
         timeout_s: how long pictures and calibration may take [s].
 
     Raises:
@@ -349,11 +349,11 @@ class RosRobot:
         self._began = time.monotonic()
 
     def reset(self, seed: int) -> Observation:
-        """Observe: a person arranges the table."""
+        """Only observe, because a person arranges the table."""
         return self.observe()
 
     def observe(self, *, masks: bool = False) -> Observation:
-        """Take a new picture with every camera; never masks.
+        """Take a new image with every camera. There are never masks.
 
         Raises:
             ConnectionLost: if the connection broke.
@@ -378,7 +378,7 @@ class RosRobot:
         return tuple(_picture(self._bridge.received(topic)[-1], topic) for topic in topics)
 
     def act(self, action: Float[np.ndarray, "3"]) -> None:
-        """Send a velocity again and again for 0.2 s, then zero.
+        """Send a velocity repeatedly for 0.2 s, then zero.
 
         Raises:
             InvalidInput: if it is no action.
@@ -394,11 +394,11 @@ class RosRobot:
         self._bridge.wait({}, 0.0)  # raises if the connection broke
 
     def start(self) -> None:
-        """Let velocities be sent."""
+        """Allow velocities to be sent."""
         self._halted.clear()
 
     def stop(self) -> None:
-        """Send zero, and no other velocity after it until `start`; from any thread."""
+        """Send zero, and no other velocity until `start`. Any thread may call this."""
         self._halted.set()
         with self._sending:
             self._publish(np.zeros(3))
@@ -422,7 +422,7 @@ class RosRobot:
         return tuple(described)
 
     def _complete_tree(self, frames: list[str]) -> TransformTree:
-        """Wait for transforms that lead from the table to all frames; raise the error of the first frame without."""
+        """Wait for transforms from the table to all frames; raise the error of the first frame without one."""
         end = time.monotonic() + self._timeout_s
         while True:
             count = self._bridge.count(*_TRANSFORMS)

@@ -122,7 +122,7 @@ def test_a_pusher_slightly_outside_returns_and_one_far_outside_is_not_moved():
     guard.act(-RIGHT)
     assert near.place[0] < 0.12
     far = Marble((0.3, 0.0))
-    with pytest.raises(InvalidInput, check=about("place of the pusher")):
+    with pytest.raises(InvalidInput, check=about("position of the pusher")):
         guarded(far).act(-RIGHT)
     assert far.velocities == far.calls == []
 
@@ -158,7 +158,7 @@ def test_a_pusher_that_goes_too_far_or_another_way_is_stopped(share):
     world = Marble(shares=[share] * 3)
     guard = guarded(world)
     guard.act(-RIGHT)
-    with pytest.raises(RobotStopped, check=about("away from where")):
+    with pytest.raises(RobotStopped, check=about("away from its commanded path")):
         guard.observe()
     assert world.calls == ["start", "stop"]
     with pytest.raises(RobotStopped):
@@ -201,7 +201,7 @@ def test_a_pusher_that_is_moved_by_hand_before_it_is_started_is_where_it_is_seen
 
 def test_nothing_moves_before_its_place_is_known_or_for_what_is_no_action():
     world = Marble()
-    with pytest.raises(InvalidInput, check=about("place of the pusher")):
+    with pytest.raises(InvalidInput, check=about("position of the pusher")):
         GuardedWorld(world, LIMITS).act(RIGHT)
     guard = guarded(world)
     with pytest.raises(InvalidInput, check=about("action")):
