@@ -345,7 +345,8 @@ def convert(path: Path, info: ObjectInfo, library: AssetLibrary, source: str) ->
         InvalidInput: if the mesh is not of a tabletop object's size, or encloses no volume.
         FetchFailed: if the disk is full.
     """
-    from osfcore.objects.mesh import PLAIN_SIDE, read_mesh, read_msh
+    from osfcore.objects.mesh import read_mesh, read_msh
+    from osfcore.objects.surface import PLAIN_SIDE
 
     mesh = read_msh(path) if path.suffix == ".msh" else read_mesh(path)
     if max(mesh.texture.shape) <= PLAIN_SIDE:
@@ -427,7 +428,7 @@ def add_object(mesh_path: Path, new: NewObject, library: AssetLibrary, *, force:
     """Put a user's own textured mesh into the library.
 
     Args:
-        mesh_path: OBJ, GLB or another format of `read_mesh`.
+        mesh_path: of a format of `read_mesh`.
         new: its name, mass and other facts.
         library: where it goes.
         force: replace an object of that name.
