@@ -302,6 +302,7 @@ def read_mesh(path: Path, scale: float = 1.0, unpacked: Path | None = None) -> T
         files.check()
         if not surfaces:
             raise CorruptFile(files.source, "it holds no triangles")
+        _check_count(sum(len(s.faces) for s in surfaces), files.source)  # before they fill a texture
         whole = _whole(surfaces, files.source)
     except OsfError:
         raise
@@ -447,8 +448,7 @@ def textured_mesh(
     vertices, faces, uv = vertices[used], inverse.reshape(faces.shape), uv[used]
     if not np.all(np.isfinite(vertices)) or not np.all(np.isfinite(uv)):
         raise CorruptFile(source, "it has coordinates that are not finite")
-    if len(faces) > MAX_FACES:
-        raise InvalidInput(f"number of triangles of {source}", len(faces), f"at most {MAX_FACES}; simplify the mesh")
+    _check_count(len(faces), source)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     longest = float((high - low).max())
     if not MIN_LENGTH_M <= longest <= MAX_LENGTH_M:
@@ -472,6 +472,11 @@ def textured_mesh(
         uv=np.clip(uv, 0, 1).astype(np.float32),
         texture=texture if is_clean else clean_texture(texture, uv, faces),
     )
+
+
+def _check_count(faces: int, source: Path | str) -> None:
+    if faces > MAX_FACES:
+        raise InvalidInput(f"number of triangles of {source}", faces, f"at most {MAX_FACES}; simplify the mesh")
 
 
 def _weld(vertices: Float[np.ndarray, "P 3"]) -> tuple[Float[np.ndarray, "Q 3"], Int[np.ndarray, "P"]]:

@@ -65,7 +65,8 @@ def read_obj(path: Path, files: NamedFiles, max_faces: int) -> list[Surface]:
             corners.setdefault(material, []).extend(corner for pair in triangles for corner in (first, *pair))
             count += len(triangles)
             if count > max_faces:
-                raise InvalidInput(f"number of triangles of {files.source}", f"over {max_faces}", "at most that")
+                allowed = f"at most {max_faces}; simplify the mesh"
+                raise InvalidInput(f"number of triangles of {files.source}", "more", allowed)
         elif key == "usemtl":
             material = rest
         elif key == "mtllib":
