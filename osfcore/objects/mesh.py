@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MAX_UNPACKED_BYTES = 1 << 30
 MAX_FILES = 1000
 _GLB_MAGIC, _ZIP_MAGIC = b"glTF", b"PK"
-_SUFFIXES, _PLAIN_SUFFIXES = (".obj", ".glb", ".gltf", ".ply"), (".stl", ".off")  # the latter hold hardly any colours
+_RANKS = ((".obj", ".glb", ".gltf"), (".ply",), (".stl", ".off"))  # scans come with copies that have fewer colours
 _EXPECTED = "a GLB, or a zip of an OBJ with its MTL and texture"
 _GLB_NAME = "the uploaded mesh.glb"  # as messages call it
 
@@ -73,8 +73,8 @@ def unpack_mesh(file: Path, out: Path) -> Path:
         out.mkdir()
         return shutil.copyfile(file, out / _GLB_NAME)
     paths = [p for p in check_zip(file, MAX_FILES) if p.name[:1] != "." and p.parts[0] != "__MACOSX"]
-    meshes = [p for p in paths if p.suffix.lower() in _SUFFIXES]
-    meshes = meshes or [p for p in paths if p.suffix.lower() in _PLAIN_SUFFIXES]
+    ranked = ([p for p in paths if p.suffix.lower() in suffixes] for suffixes in _RANKS)
+    meshes = next(filter(None, ranked), [])
     if not meshes:
         raise CorruptFile(file, f"it holds no mesh; send {_EXPECTED}")
     if len(meshes) > 1:

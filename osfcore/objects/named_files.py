@@ -15,6 +15,9 @@ from PIL import Image
 from osfcore.errors import CorruptFile, InvalidInput, shown
 from osfcore.objects.surface import MAX_IMAGE_PIXELS
 
+# Others that Pillow knows start programs or hold no pictures of surfaces.
+_IMAGE_KINDS = ("PNG", "JPEG", "WEBP", "AVIF", "TIFF", "TGA", "BMP", "GIF", "PPM", "DDS", "JPEG2000")
+
 
 class NamedFiles:
     """Finds a file by its path from the mesh, or else by its name alone in any spelling.
@@ -79,7 +82,7 @@ class NamedFiles:
             InvalidInput: if it has over 67 million pixels.
         """
         try:
-            with Image.open(io.BytesIO(data)) as image:
+            with Image.open(io.BytesIO(data), formats=_IMAGE_KINDS) as image:
                 if image.width * image.height > MAX_IMAGE_PIXELS:
                     size = f"{image.width} x {image.height}"
                     raise InvalidInput(f"size of the texture {shown(name)} [px]", size, "at most 8192 x 8192")
@@ -88,7 +91,7 @@ class NamedFiles:
                 return np.asarray(image.convert("RGB"))
         except (InvalidInput, MemoryError):
             raise
-        except Exception as error:  # a decoder of forty formats raises anything on damaged input
+        except Exception as error:  # decoders raise anything on damaged input
             reason = f"its texture {shown(name)} cannot be read; save it as PNG or JPEG"
             raise CorruptFile(self.source, reason) from error
 

@@ -487,6 +487,7 @@ def test_colours_of_binary_stl(tmp_path, is_magics):
 
 def test_a_zip_is_read_as_its_mesh_and_stays(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("d/without_colours.ply", BOX.export(file_type="ply"))
         for name, content in {"d/a.obj": obj(), "d/m.mtl": "newmtl a\nmap_Kd t.png\n", "t.png": encoded(STRIP)}.items():
             archive.writestr(name, content)
     np.testing.assert_allclose(sides(read_mesh(tmp_path / "a.zip")), PALETTE, atol=1)
