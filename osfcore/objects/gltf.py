@@ -249,6 +249,8 @@ def _diffuse(material: dict[str, Any]) -> tuple[Float[np.ndarray, "3"], dict[str
     gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if gloss is not None:
         factor, texture = gloss.get("diffuseFactor", (1, 1, 1)), gloss.get("diffuseTexture")
+        if not any(factor[:3]):  # a metal, whose base colour is what it reflects
+            factor, texture = gloss.get("specularFactor", (1, 1, 1)), gloss.get("specularGlossinessTexture")
     emitted = material.get("emissiveFactor", (0, 0, 0))
     if any(emitted) and (not any(factor[:3]) or (not base and gloss is None)):
         factor, texture = emitted, material.get("emissiveTexture")

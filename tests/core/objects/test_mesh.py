@@ -193,6 +193,7 @@ def test_baked_colours_come_back_by_bilinear_sampling(tmp_path, kind):
 BASE = {"baseColorTexture": {"index": 0}}
 BLACK = {"baseColorFactor": [0, 0, 0, 1]}
 IMAGE = {"pbrMetallicRoughness": BASE}
+GOLD = {"diffuseFactor": [0, 0, 0, 1], "specularFactor": [1, 0.8, 0.3]}
 GLOSS = {"diffuseFactor": [1, 0.2, 1, 1], "diffuseTexture": {"index": 0}}
 
 
@@ -205,6 +206,7 @@ GLOSS = {"diffuseFactor": [1, 0.2, 1, 1], "diffuseTexture": {"index": 0}}
         ({}, {"pbrMetallicRoughness": BASE | {"baseColorFactor": [0.5, 1, 1, 1]}}, True, (0.5, 1, 1)),
         ({}, IMAGE | {"extensions": {"KHR_materials_unlit": {}}}, True, (1, 1, 1)),
         ({}, {"extensions": {"KHR_materials_pbrSpecularGlossiness": GLOSS}}, True, (1, 0.2, 1)),
+        ({}, {"extensions": {"KHR_materials_pbrSpecularGlossiness": GOLD}}, False, (1, 0.8, 0.3)),
         ({}, {"emissiveFactor": [1, 1, 0.5], "emissiveTexture": {"index": 0}}, True, (1, 1, 0.5)),
         ({}, {"pbrMetallicRoughness": BLACK, "emissiveFactor": [1, 0.5, 0]}, False, (1, 0.5, 0)),
         ({"COLOR_0": np.full((36, 4), 51, np.uint8)}, None, False, (0.2, 0.2, 0.2)),
