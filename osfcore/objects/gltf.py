@@ -210,8 +210,10 @@ class _Reader:
             rows = self._rows(accessor, kind, width, count)
         elif sparse is not None:
             rows = np.zeros((count, width), _TYPES[kind])
-        else:  # its numbers are in an extension that compresses them
-            raise CorruptFile(self._files.source, f"its triangles are compressed; {_UNCOMPRESSED}")
+        else:  # its numbers are in an extension that compresses them, though nothing says that it is required
+            used = self._tree.get("extensionsUsed", ())
+            unknown = f"its triangles are compressed; {_UNCOMPRESSED}"
+            raise CorruptFile(self._files.source, next((_ADVICE[name] for name in used if name in _ADVICE), unknown))
         if sparse is not None:
             rows = rows.copy()
             where = self._rows(sparse["indices"], sparse["indices"]["componentType"], 1, sparse["count"])[:, 0]

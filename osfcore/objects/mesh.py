@@ -1,4 +1,8 @@
-"""Textured meshes: read from files of strangers, brought into the object frame and checked; orientations at rest."""
+"""Textured meshes: read from files of strangers, brought into the object frame and checked; orientations at rest.
+
+`read_mesh` reads what people bring, for page, REST and command line alike: glTF by `gltf`, OBJ by `obj`, the rest by
+trimesh. `named_files` finds what a mesh names, and `surface` makes one texture of all colours.
+"""
 
 from __future__ import annotations
 

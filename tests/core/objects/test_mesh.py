@@ -362,9 +362,10 @@ def test_what_a_gltf_needs_and_nobody_reads_is_named(tmp_path, required, word):
 def test_compressed_triangles_and_damaged_images_are_refused(tmp_path):
     description, buffer = gltf({"POSITION": CORNERS})
     del description["accessors"][0]["bufferView"]
-    (tmp_path / "a.glb").write_bytes(glb(description, buffer))
-    with pytest.raises(CorruptFile, check=about("compressed")):
-        read_mesh(tmp_path / "a.glb")
+    for used, word in (([], "compressed"), (["KHR_draco_mesh_compression"], "Draco")):
+        (tmp_path / "a.glb").write_bytes(glb(description | {"extensionsUsed": used}, buffer))
+        with pytest.raises(CorruptFile, check=about(word)):
+            read_mesh(tmp_path / "a.glb")
     with pytest.raises(CorruptFile, check=about("texture")):
         read_glb(tmp_path, {"TEXCOORD_0": UV}, IMAGE, b"\x89PNG\r\n\x1a\n and no more")
 
