@@ -117,6 +117,21 @@ def coverage(
     return mask
 
 
+def _pinned(
+    uv: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"], width: int, height: int
+) -> UInt8[np.ndarray, "height width"]:
+    """Return 1 for each texel that bilinear sampling mixes for a face that is smaller than a texel.
+
+    Such faces take one colour of a palette, whose texels must not be taken for the rim of a chart.
+    """
+    mask = np.zeros((height, width), np.uint8)
+    corners = (np.stack([uv[:, 0] * width, (1 - uv[:, 1]) * height], axis=1) - 0.5)[faces]
+    x, y = np.floor(corners[np.ptp(corners, axis=1).max(axis=1) < 1].reshape(-1, 2)).astype(int).T
+    for right, below in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        mask[np.clip(y + below, 0, height - 1), np.clip(x + right, 0, width - 1)] = 1
+    return mask
+
+
 def _fill(image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
     """Give texels of no weight the smoothly interpolated colour of those that have some, by push-pull."""
     height, width = weight.shape
@@ -156,10 +171,11 @@ def clean_texture(
         max_side: longest side of the result [texels].
     """
     height, width = texture.shape[:2]
-    covered = coverage(uv, faces, width, height)
+    covered, pinned = coverage(uv, faces, width, height), _pinned(uv, faces, width, height)
     if not covered.any():
         return texture
-    weight = _without_rim(covered, _RIM_TEXELS if max(height, width) > max_side else 1).astype(np.float32)
+    inner = _without_rim(covered | pinned, _RIM_TEXELS if max(height, width) > max_side else 1)
+    weight = (inner | pinned).astype(np.float32)
     image = texture.astype(np.float32)
     scale = max_side / max(height, width)
     if scale < 1:

@@ -377,6 +377,14 @@ def test_coordinates_do_not_matter_where_there_is_one_colour(tmp_path, image):
     np.testing.assert_allclose(sides(mesh), [(10, 200, 30) if image else (255, 255, 255)] * 6, atol=1)
 
 
+@pytest.mark.parametrize(("texels_each", "place"), [(1, 0.5), (4, 0.4)])
+def test_sides_that_take_one_colour_each_of_a_palette_keep_it(tmp_path, texels_each, place):
+    palette = np.repeat(PALETTE[None], texels_each, axis=1)
+    uv = np.column_stack([(SIDE + place) / 6, np.full(36, 0.5)]).astype(np.float32)
+    mesh = read_glb(tmp_path, {"TEXCOORD_0": uv}, IMAGE, encoded(palette))
+    np.testing.assert_allclose(sides(mesh), turned(PALETTE), atol=1)
+
+
 def test_repeated_textures_are_tiled(tmp_path):
     ramp = np.zeros((16, 16, 3), np.uint8)
     ramp[..., 0] = np.arange(16) * 15
