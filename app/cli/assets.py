@@ -75,10 +75,10 @@ class AssetsFetch(DataCommand):
 
 @dataclass(frozen=True)
 class AssetsAdd(DataCommand):
-    """Add an object of your own from a textured mesh."""
+    """Add an object of your own from a textured mesh, read as the page reads it."""
 
     mesh: tyro.conf.Positional[Path]
-    """OBJ, GLB or PLY file, in metres."""
+    """OBJ, GLB, glTF, PLY, STL or OFF file in metres, or a zip of one with the files that it names."""
     name: str
     """What scenes call it: lower-case letters, digits, '_' and '-'."""
     mass: float | None = None

@@ -153,14 +153,18 @@ def unpack_observation(archive: Path, out: Path, *, max_bytes: int = MAX_BYTES, 
     return unpack(archive, out, _OBSERVATION, max_bytes, max_files)
 
 
-def check_zip(archive: Path, max_files: int = MAX_FILES) -> None:
-    """Check within milliseconds, without unpacking, that a file is a zip with few enough files.
+def check_zip(archive: Path, max_files: int = MAX_FILES) -> list[PurePosixPath]:
+    """Return the paths in a zip within milliseconds, without unpacking, if it has few enough files.
 
     Raises:
         CorruptFile: if it is no zip archive, or holds more than `max_files` files.
     """
-    with _opened(Path(archive), max_files):
-        pass
+    with _opened(Path(archive), max_files) as file:
+        return [_plain_path(info) for info in file.infolist() if not info.is_dir()]
+
+
+def _plain_path(info: zipfile.ZipInfo) -> PurePosixPath:
+    return PurePosixPath(info.filename.replace("\\", "/"))  # some Windows tools write backslashes
 
 
 @contextlib.contextmanager
@@ -169,7 +173,7 @@ def _opened(archive: Path, max_files: int) -> Iterator[zipfile.ZipFile]:
     try:
         with archive.open("rb") as raw:
             _check_directory(raw, max_files)
-            with zipfile.ZipFile(raw) as file:
+            with _with_names(raw) as file:
                 yield file
     except OsfError:  # these are ValueErrors, too
         raise
@@ -179,6 +183,14 @@ def _opened(archive: Path, max_files: int) -> Iterator[zipfile.ZipFile]:
         raise CorruptFile(archive, "it is no zip archive or a damaged one") from error
     except RuntimeError as error:
         raise CorruptFile(archive, "it is packed in a way that cannot be read; a plain zip is expected") from error
+
+
+def _with_names(raw: BinaryIO) -> zipfile.ZipFile:
+    """Open a zip and decode its names: macOS, and `zip` without a locale, write UTF-8 and do not say so."""
+    try:
+        return zipfile.ZipFile(raw, metadata_encoding="utf-8")
+    except UnicodeDecodeError:
+        return zipfile.ZipFile(raw)
 
 
 def unpack(archive: Path, out: Path, kind: ArchiveKind, max_bytes: int = MAX_BYTES, max_files: int = MAX_FILES) -> Path:
@@ -235,13 +247,12 @@ def _members(
 
 
 def _safe_path(archive: Path, info: zipfile.ZipInfo, max_depth: int) -> PurePosixPath:
-    name = info.filename.replace("\\", "/")  # some Windows tools write backslashes
-    place = f"it holds {info.filename[:100]!r}"
-    path, windows = PurePosixPath(name), PureWindowsPath(name)
+    path, place = _plain_path(info), f"it holds {info.filename[:100]!r}"
+    windows = PureWindowsPath(str(path))
     if path.is_absolute() or windows.drive or windows.root or ".." in path.parts:
         raise CorruptFile(archive, f"{place}, a name that leads out of the archive")
     is_long = any(len(part.encode(errors="replace")) > _MAX_NAME_BYTES for part in path.parts)
-    if is_long or not 1 <= len(path.parts) <= max_depth or not name.isprintable():
+    if is_long or not 1 <= len(path.parts) <= max_depth or not str(path).isprintable():
         raise CorruptFile(archive, f"{place}, a name that is too long, too deep or not printable")
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind not in (0, stat.S_IFREG, stat.S_IFDIR):

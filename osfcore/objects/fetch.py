@@ -346,7 +346,8 @@ def convert(path: Path, info: ObjectInfo, library: AssetLibrary, source: str) ->
         InvalidInput: if the mesh is not as large as a tabletop object, or encloses no volume.
         FetchFailed: if the disk is full.
     """
-    from osfcore.objects.mesh import PLAIN_SIDE, read_mesh, read_msh
+    from osfcore.objects.mesh import read_mesh, read_msh
+    from osfcore.objects.surface import PLAIN_SIDE
 
     mesh = read_msh(path) if path.suffix == ".msh" else read_mesh(path)
     if max(mesh.texture.shape) <= PLAIN_SIDE:
@@ -429,7 +430,7 @@ def add_object(mesh_path: Path, new: NewObject, library: AssetLibrary, *, force:
     """Add a user's textured mesh to the library.
 
     Args:
-        mesh_path: file in OBJ, GLB or another format of `read_mesh`.
+        mesh_path: file in a format of `read_mesh`.
         new: name, mass and other facts.
         library: library to write to.
         force: whether to replace an object of that name.

@@ -1,156 +1,35 @@
-"""Textured meshes: read from files of strangers, brought into the object frame and checked; orientations at rest."""
+"""Textured meshes: read from files of strangers, brought into the object frame and checked; orientations at rest.
+
+`read_mesh` reads what people bring, for page, REST and command line alike: glTF by `gltf`, OBJ by `obj`, the rest by
+trimesh. `named_files` finds what a mesh names, and `surface` makes one texture of all colours.
+"""
 
 from __future__ import annotations
 
-import zipfile
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+import io
+import re
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
-from trimesh.resolvers import Resolver
+from jaxtyping import Float, Int, UInt8, UInt16
+from trimesh.visual.color import to_float
 
-from osfcore.errors import CorruptFile, InvalidInput, OsfError, shown
+from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.geometry.poses import quaternion_from_matrix
 from osfcore.io.archives import ArchiveKind, check_zip, unpack
 from osfcore.objects.asset import RestingPoses, TexturedMesh
+from osfcore.objects.gltf import read_gltf
+from osfcore.objects.named_files import NamedFiles
+from osfcore.objects.obj import GREY, read_obj
+from osfcore.objects.surface import Surface, TexturedPiece, joined, key_of, pieces_of
 
 if TYPE_CHECKING:
     import trimesh
-
-
-# Colours of loaded meshes as one texture: images, colour factors, vertex or face colours, several materials.
-
-
-MAX_IMAGE_PIXELS = 8192 * 8192
-_MAX_TILES = 4  # how often a texture may repeat along one side
-PLAIN_SIDE = 4  # texels a side of the texture of a body of one colour
-_CELL = 4  # texels a side of the cell that one face's vertex colours get
-_GREY = (178, 178, 178)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class TexturedPiece:
-    """Triangles with one texture.
-
-    Attributes:
-        vertices: in the file's units.
-        faces: vertex indices.
-        uv: in [0, 1], v upwards.
-        texture: RGB, first row at v = 1.
-        is_padded: whether texels around the faces' own continue their colours already.
-    """
-
-    vertices: Float[np.ndarray, "P 3"]
-    faces: Int[np.ndarray, "F 3"]
-    uv: Float[np.ndarray, "P 2"]
-    texture: UInt8[np.ndarray, "h w 3"]
-    is_padded: bool = False
-
-
-def piece_of(mesh: trimesh.Trimesh) -> TexturedPiece:
-    """Return one loaded mesh with its image, its vertex or face colours, or a grey.
-
-    Raises:
-        InvalidInput: if the image has over 67 million pixels or repeats too often.
-    """
-    visual: Any = mesh.visual  # trimesh's kinds of visuals share no base with these attributes
-    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
-    uv = getattr(visual, "uv", None)
-    if visual.kind == "texture":
-        material = visual.material
-        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-        factor = getattr(material, "baseColorFactor", None)
-        if image is not None and uv is not None and len(uv) == len(vertices):
-            if image.width * image.height > MAX_IMAGE_PIXELS:
-                raise InvalidInput("texture size [px]", f"{image.width} x {image.height}", "at most 8192 x 8192")
-            texture = np.asarray(image.convert("RGB"))
-            if factor is not None:
-                texture = np.round(texture * _rgb(factor)).astype(np.uint8)
-            return _unrepeated(TexturedPiece(vertices, faces, np.asarray(uv, float), texture))
-        colour = _rgb(material.main_color) * 255
-    elif visual.kind in ("vertex", "face"):
-        by_face = np.repeat(np.asarray(visual.face_colors)[:, None], 3, axis=1) if visual.kind == "face" else None
-        colours = np.asarray(visual.vertex_colors)[faces] if by_face is None else by_face
-        return _baked(vertices, faces, colours[..., :3].astype(float))
-    else:
-        colour = np.array(_GREY)
-    texture = np.broadcast_to(np.round(colour).astype(np.uint8), (PLAIN_SIDE, PLAIN_SIDE, 3)).copy()
-    return TexturedPiece(vertices, faces, np.full((len(vertices), 2), 0.5), texture)
-
-
-def _rgb(colour: object) -> Float[np.ndarray, "3"]:
-    """Return the first three channels in [0, 1], from bytes or fractions."""
-    array = np.asarray(colour)
-    return np.clip(array[:3] / 255.0 if array.dtype.kind in "ui" else array[:3].astype(float), 0, 1)
-
-
-def _unrepeated(piece: TexturedPiece) -> TexturedPiece:
-    """Bring texture coordinates into [0, 1], and tile the texture where a face spans several copies of it."""
-    if not np.all(np.isfinite(piece.uv)) or (piece.uv.min() >= 0 and piece.uv.max() <= 1):
-        return piece
-    corners = piece.uv[piece.faces]
-    corners = corners - np.floor(corners.min(axis=1, keepdims=True) + 1e-6)
-    tiles = np.maximum(np.ceil(corners.max(axis=(0, 1)) - 1e-6), 1).astype(int)
-    if tiles.max() > _MAX_TILES:
-        raise InvalidInput("repetitions of the texture within one triangle", int(tiles.max()), f"at most {_MAX_TILES}")
-    texture = np.tile(piece.texture, (tiles[1], tiles[0], 1))
-    faces = np.arange(3 * len(piece.faces)).reshape(-1, 3)
-    return TexturedPiece(piece.vertices[piece.faces].reshape(-1, 3), faces, (corners / tiles).reshape(-1, 2), texture)
-
-
-def _baked(
-    vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "F 3"], colours: Float[np.ndarray, "F 3 3"]
-) -> TexturedPiece:
-    """Make a texture with a small square for each face, in which bilinear sampling gives the corners' colours."""
-    across = int(np.ceil(np.sqrt(len(faces))))
-    down = -(-len(faces) // across)
-    index = np.arange(len(faces))
-    origin = np.stack([index % across, index // across], axis=1) * _CELL
-    # Corners lie on texel centres (0, 0), (2, 0), (0, 2) of the cell; the rest of the cell continues the same plane.
-    y, x = np.meshgrid(np.arange(_CELL) / 2, np.arange(_CELL) / 2, indexing="ij")
-    a, b, c = colours[:, 0], colours[:, 1], colours[:, 2]
-    cells = a[:, None, None] + x[..., None] * (b - a)[:, None, None] + y[..., None] * (c - a)[:, None, None]
-    padded = np.zeros((across * down, _CELL, _CELL, 3))
-    padded[: len(faces)] = cells
-    rows = padded.reshape(down, across, _CELL, _CELL, 3).transpose(0, 2, 1, 3, 4)
-    texture = np.clip(np.round(rows.reshape(down * _CELL, across * _CELL, 3)), 0, 255).astype(np.uint8)
-    pixel = origin[:, None] + np.array([[0.5, 0.5], [2.5, 0.5], [0.5, 2.5]])
-    uv = pixel / (np.array([across, down]) * _CELL)
-    uv[..., 1] = 1 - uv[..., 1]
-    flat = np.arange(3 * len(faces)).reshape(-1, 3)
-    return TexturedPiece(vertices[faces].reshape(-1, 3), flat, uv.reshape(-1, 2), texture, is_padded=True)
-
-
-def joined(pieces: list[TexturedPiece]) -> TexturedPiece:
-    """Join pieces into one, their textures (equal ones once) stacked into one image."""
-    if len(pieces) == 1:
-        return pieces[0]
-    images = {_key(p.texture): p.texture for p in pieces}
-    width = max(image.shape[1] for image in images.values())
-    tops, rows, top = {}, [], 0
-    for key, image in images.items():
-        height = max(round(image.shape[0] * width / image.shape[1]), 1)
-        rows.append(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR))
-        tops[key] = (top, height)
-        top += height
-    if width * top > MAX_IMAGE_PIXELS:
-        raise InvalidInput("size of all textures together [px]", f"{width} x {top}", "at most 8192 x 8192")
-    uvs, faces, offset = [], [], 0
-    for piece in pieces:
-        start, height = tops[_key(piece.texture)]
-        below = (1 - piece.uv[:, 1]) * height + start
-        uvs.append(np.stack([piece.uv[:, 0], 1 - below / top], axis=1))
-        faces.append(piece.faces + offset)
-        offset += len(piece.vertices)
-    vertices = np.concatenate([p.vertices for p in pieces])
-    return TexturedPiece(vertices, np.concatenate(faces), np.concatenate(uvs), np.concatenate(rows))
-
-
-def _key(texture: UInt8[np.ndarray, "h w 3"]) -> tuple[tuple[int, ...], bytes]:
-    return texture.shape, texture.tobytes()
 
 
 # A mesh that a stranger sends: one GLB, or a zip with a mesh and the files that it names. Nothing in it is trusted.
@@ -159,8 +38,9 @@ def _key(texture: UInt8[np.ndarray, "h w 3"]) -> tuple[tuple[int, ...], bytes]:
 MAX_UNPACKED_BYTES = 1 << 30
 MAX_FILES = 1000
 _GLB_MAGIC, _ZIP_MAGIC = b"glTF", b"PK"
-_SUFFIXES = (".obj", ".glb", ".gltf", ".ply")
+_RANKS = ((".obj", ".glb", ".gltf"), (".ply",), (".stl", ".off"))  # scans come with copies that have fewer colours
 _EXPECTED = "a GLB, or a zip of an OBJ with its MTL and texture"
+_GLB_NAME = "the uploaded mesh.glb"  # as messages call it
 
 
 def check_upload(file: Path) -> bool:
@@ -195,73 +75,16 @@ def unpack_mesh(file: Path, out: Path) -> Path:
     """
     if check_upload(file):
         out.mkdir()
-        return file.rename(out / "mesh.glb")
-    with zipfile.ZipFile(file) as archive:
-        paths = [PurePosixPath(name.replace("\\", "/")) for name in archive.namelist()]
-    meshes = [p for p in paths if p.suffix.lower() in _SUFFIXES and p.name[0] != "." and p.parts[0] != "__MACOSX"]
+        return shutil.copyfile(file, out / _GLB_NAME)
+    paths = [p for p in check_zip(file, MAX_FILES) if p.name[:1] != "." and p.parts[0] != "__MACOSX"]
+    ranked = ([p for p in paths if p.suffix.lower() in suffixes] for suffixes in _RANKS)
+    meshes = next(filter(None, ranked), [])
     if not meshes:
         raise CorruptFile(file, f"it holds no mesh; send {_EXPECTED}")
     if len(meshes) > 1:
         raise CorruptFile(file, f"it holds {len(meshes)} meshes, {meshes[0]} and {meshes[1]} among them; send one")
     kind = ArchiveKind("mesh", meshes[0], (), _EXPECTED)
     return unpack(file, out, kind, MAX_UNPACKED_BYTES, MAX_FILES) / meshes[0]
-
-
-class UnpackedFiles(Resolver):
-    """The files that a mesh may name: those of one folder, by their path from the mesh or else by their name alone.
-
-    Args:
-        root: the folder.
-        mesh: where the mesh lies in it.
-    """
-
-    def __init__(self, root: Path, mesh: Path) -> None:
-        self._root, self._folder = root.resolve(), mesh.resolve().parent
-        self.missing: list[str] = []
-
-    def get(self, key: str) -> bytes:
-        """Return the contents of a file.
-
-        Raises:
-            FileNotFoundError: if it is not among the unpacked; it is then in `missing`, too.
-        """
-        plain = key.strip().replace("\\", "/")
-        direct = (self._folder / plain).resolve()
-        if direct.is_relative_to(self._root) and direct.is_file():
-            return direct.read_bytes()
-        wanted = PurePosixPath(plain).name
-        for path in sorted(self._root.rglob("*")):  # modellers write paths of their own machine
-            if path.is_file() and path.name.lower() == wanted.lower():
-                return path.read_bytes()
-        self.missing.append(shown(wanted))
-        raise FileNotFoundError(wanted)
-
-    def write(self, name: str, data: object) -> None:
-        """Refuse to write beside a stranger's mesh.
-
-        Raises:
-            PermissionError: always.
-        """
-        del data
-        raise PermissionError(name)
-
-    def keys(self) -> list[str]:
-        """The names of all files."""
-        return sorted(str(path.relative_to(self._root)) for path in self._root.rglob("*") if path.is_file())
-
-    def namespaced(self, namespace: str) -> UnpackedFiles:
-        """Return the same files, seen from a folder among them."""
-        return UnpackedFiles(self._root, self._folder / namespace / "mesh")
-
-    def check(self, mesh: Path) -> None:
-        """Refuse a mesh that names files which did not come with it.
-
-        Raises:
-            CorruptFile: if there is one.
-        """
-        if self.missing:
-            missing = ", ".join(dict.fromkeys(self.missing))
-            raise CorruptFile(mesh, f"it names {missing}, which did not come with it; put the mesh and it into one zip")
 
 
 # Textures without traces of their background: reduced by a coverage-weighted filter, filled around the charts.
@@ -291,6 +114,21 @@ def coverage(
     corners = np.round(pixels * 2**_SUBPIXEL_BITS).astype(np.int32)[faces]
     for triangle in corners:
         cv2.fillConvexPoly(mask, triangle, 1, lineType=cv2.LINE_8, shift=_SUBPIXEL_BITS)
+    return mask
+
+
+def _pinned(
+    uv: Float[np.ndarray, "P 2"], faces: Int[np.ndarray, "F 3"], width: int, height: int
+) -> UInt8[np.ndarray, "height width"]:
+    """Return 1 for each texel that bilinear sampling mixes for a face that is smaller than a texel.
+
+    Such faces take one colour of a palette, whose texels must not be taken for the rim of a chart.
+    """
+    mask = np.zeros((height, width), np.uint8)
+    corners = (np.stack([uv[:, 0] * width, (1 - uv[:, 1]) * height], axis=1) - 0.5)[faces]
+    x, y = np.floor(corners[np.ptp(corners, axis=1).max(axis=1) < 1].reshape(-1, 2)).astype(int).T
+    for right, below in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        mask[np.clip(y + below, 0, height - 1), np.clip(x + right, 0, width - 1)] = 1
     return mask
 
 
@@ -333,10 +171,11 @@ def clean_texture(
         max_side: longest side of the result [texels].
     """
     height, width = texture.shape[:2]
-    covered = coverage(uv, faces, width, height)
+    covered, pinned = coverage(uv, faces, width, height), _pinned(uv, faces, width, height)
     if not covered.any():
         return texture
-    weight = _without_rim(covered, _RIM_TEXELS if max(height, width) > max_side else 1).astype(np.float32)
+    inner = _without_rim(covered | pinned, _RIM_TEXELS if max(height, width) > max_side else 1)
+    weight = (inner | pinned).astype(np.float32)
     image = texture.astype(np.float32)
     scale = max_side / max(height, width)
     if scale < 1:
@@ -435,7 +274,7 @@ def resting_poses(parts: tuple[Float[np.ndarray, "_ 3"], ...]) -> RestingPoses:
 MIN_LENGTH_M, MAX_LENGTH_M = 0.005, 1.0
 MAX_FACES = 200_000
 MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
-_Y_UP_SUFFIXES = (".glb", ".gltf")
+_GLTF_SUFFIXES = (".glb", ".gltf")
 _CREASE_RAD = np.deg2rad(50.0)  # edges sharper than this stay sharp: a box must not shade like a pillow
 _MIN_THICKNESS = 1e-3  # of the longest side; thinner is a sheet, which no solver can rest on a table
 
@@ -460,41 +299,141 @@ def read_mesh(path: Path, scale: float = 1.0, unpacked: Path | None = None) -> T
     """Read a mesh file with whatever texture or colours it has.
 
     Args:
-        path: OBJ, GLB or another format that trimesh reads; its images lie beside it or inside.
-        scale: metres for one unit of the file. GLB is turned from y up to z up; other formats count as z up.
-        unpacked: for what a stranger sent, the folder that holds all that the mesh may name; it must be complete.
+        path: of one of the formats `MESH_SUFFIXES`, or a zip that holds one with all that it names.
+        scale: metres for one unit of the file. glTF is turned from y up to z up; other formats count as z up.
+        unpacked: for what a stranger sent, the folder that holds all that the mesh may name.
 
     Raises:
         InvalidInput: if there is no such file, its kind is unknown or its size is not that of a tabletop object.
-        CorruptFile: if it holds no usable triangles, or names what is not among the unpacked.
+        CorruptFile: if it holds no usable triangles, or names what is not there.
     """
-    import trimesh
-
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InvalidInput("mesh file", path.name, f"one of {', '.join(MESH_SUFFIXES)}")
+    suffix = path.suffix.lower()
+    if suffix not in (*MESH_SUFFIXES, ".zip"):
+        raise InvalidInput("mesh file", path.name, f"one of {', '.join(MESH_SUFFIXES)}, or a .zip of one")
     if not path.is_file():
         raise InvalidInput("mesh file", path, "a file that exists")
-    files = None if unpacked is None else UnpackedFiles(unpacked, path)
+    if suffix == ".zip":
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "unpacked"
+            return read_mesh(unpack_mesh(path, out), scale, out)
+    files = NamedFiles(path, unpacked)
     try:
-        scene = trimesh.load_scene(path, process=False, resolver=files)
-        pieces = [piece_of(g) for g in scene.dump() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
+        surfaces = [s for s in _surfaces(path, files) if len(s.faces)]
+        files.check()
+        if not surfaces:
+            raise CorruptFile(files.source, "it holds no triangles")
+        _check_count(sum(len(s.faces) for s in surfaces), files.source)  # before they fill a texture
+        whole = _whole(surfaces, files.source)
     except OsfError:
         raise
     except MemoryError as error:
-        raise CorruptFile(path, "it needs too much memory to be read; simplify the mesh or its texture") from error
-    except Exception as error:  # a reader of ten formats raises anything on damaged input
-        if files is not None:
-            files.check(path)
-        raise CorruptFile(path, f"it cannot be read as a mesh ({type(error).__name__})") from error
-    if files is not None:
-        files.check(path)
-    if not pieces:
-        raise CorruptFile(path, "it holds no triangles")
-    whole = joined(pieces)
-    vertices = np.asarray(whole.vertices, float) * scale
-    if path.suffix.lower() in _Y_UP_SUFFIXES:
+        reason = "it needs too much memory to be read; simplify the mesh or its texture"
+        raise CorruptFile(files.source, reason) from error
+    except Exception as error:  # readers of six formats raise anything on damaged input
+        files.check()
+        raise CorruptFile(files.source, f"it cannot be read as a mesh ({type(error).__name__})") from error
+    vertices = whole.vertices * scale
+    if suffix in _GLTF_SUFFIXES:
         vertices = vertices @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    return textured_mesh(vertices, whole.faces, whole.uv, whole.texture, path, is_clean=whole.is_padded)
+    return textured_mesh(vertices, whole.faces, whole.uv, whole.texture, files.source, is_clean=True)
+
+
+def _whole(surfaces: list[Surface], source: str) -> TexturedPiece:
+    """Join surfaces; each image is cleaned before by all the faces that show it, so that none bleeds into another."""
+    pieces = pieces_of(surfaces)
+    shown: dict[object, list[TexturedPiece]] = {}
+    for piece in pieces:
+        if not np.all(np.isfinite(piece.uv)):
+            raise CorruptFile(source, "it has coordinates that are not finite")
+        if not piece.is_padded:
+            shown.setdefault(key_of(piece.texture), []).append(piece)
+    clean = {}
+    for key, group in shown.items():
+        faces = np.concatenate([p.uv[p.faces] for p in group])
+        corners = np.arange(3 * len(faces)).reshape(-1, 3)
+        clean[key] = clean_texture(group[0].texture, faces.reshape(-1, 2), corners)
+    whole = joined([p if p.is_padded else replace(p, texture=clean[key_of(p.texture)], is_padded=True) for p in pieces])
+    scale = MAX_TEXTURE_SIDE / max(whole.texture.shape)
+    if scale >= 1:
+        return whole
+    return replace(whole, texture=cv2.resize(whole.texture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+
+
+def _surfaces(path: Path, files: NamedFiles) -> list[Surface]:
+    """Read a mesh file in its own frame and units."""
+    suffix = path.suffix.lower()
+    if suffix in _GLTF_SUFFIXES:
+        return read_gltf(path, files)
+    if suffix == ".obj":
+        return read_obj(path, files, MAX_FACES)
+    import trimesh
+
+    data, image = path.read_bytes(), None
+    options: dict[str, Any] = {}
+    if suffix == ".ply":
+        data = _with_line_feeds(data)
+        image = _ply_image(data, files)
+        options = {"skip_materials": True, "fix_texture": image is not None}
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False, **options)
+    return [_surface(mesh, image, data[:80]) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
+
+
+def _with_line_feeds(ply: bytes) -> bytes:
+    """Return a PLY whose lines end in carriage returns alone with the line ends that trimesh reads."""
+    head, mark, body = ply.partition(b"end_header\r")
+    if not mark or body.startswith(b"\n"):
+        return ply
+    is_text = b"format ascii" in head
+    return (head + mark).replace(b"\r", b"\n") + (body.replace(b"\r", b"\n") if is_text else body)
+
+
+def _ply_image(ply: bytes, files: NamedFiles) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Return the image that a PLY names in a comment, as MeshLab writes it."""
+    header = ply[: ply.find(b"end_header")].decode("utf-8", errors="replace")
+    names = re.findall(r"(?im)^comment\s+TextureFile\s+(.*\S)", header)
+    if len(names) > 1:
+        raise CorruptFile(files.source, f"it has {len(names)} textures, which are read of OBJ and glTF only")
+    return files.image(names[0]) if names else None
+
+
+def _surface(mesh: trimesh.Trimesh, image: UInt8[np.ndarray, "h w 3"] | None, head: bytes) -> Surface:
+    """Return what trimesh read, with its image, else with its colours, else grey.
+
+    Args:
+        mesh: as trimesh has it.
+        image: of a PLY.
+        head: the first 80 bytes of the file, where STL notes how its colours are meant.
+    """
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+    visual: Any = mesh.visual  # trimesh's kinds of visuals share no base with these attributes
+    uv = getattr(visual, "uv", None)
+    if image is not None and uv is not None and len(uv) == len(vertices):
+        return Surface(vertices, faces, np.ones((len(faces), 3, 3)), np.asarray(uv, float), image)
+    by_vertex = visual.vertex_colors if visual.kind == "vertex" else mesh.vertex_attributes.get("color")
+    by_face = visual.face_colors if visual.kind == "face" else mesh.face_attributes.get("color")
+    if by_vertex is not None and len(by_vertex) == len(vertices):
+        colours = to_float(by_vertex)[faces, :3]
+    elif by_face is not None:
+        colours = np.repeat(to_float(by_face)[:, None, :3], 3, axis=1)
+    elif "stl" in mesh.face_attributes:
+        colours = np.repeat(_stl_colours(mesh.face_attributes["stl"], head)[:, None], 3, axis=1)
+    else:
+        colours = np.full((len(faces), 3, 3), GREY)
+    return Surface(vertices, faces, colours)
+
+
+def _stl_colours(attributes: UInt16[np.ndarray, "F"], head: bytes) -> Float[np.ndarray, "F 3"]:
+    """Return the colours of faces in the spare 16 bits of a binary STL, grey where there is none.
+
+    Five bits a colour. Magics notes COLOR= and a colour for the faces whose highest bit is set, and begins with red;
+    others (VisCAM, SolidView, MeshLab) begin with blue, and set the highest bit where there is a colour.
+    """
+    levels = (attributes[:, None].astype(int) >> np.array([0, 5, 10]) & 31) / 31
+    is_high = (attributes >> 15 == 1)[:, None]
+    of_magics = re.search(rb"COLOR=(...)", head, re.DOTALL)
+    if of_magics:
+        return np.where(is_high, np.frombuffer(of_magics[1], np.uint8) / 255, levels)
+    return np.where(is_high, levels[:, ::-1], GREY)
 
 
 def textured_mesh(
@@ -529,8 +468,7 @@ def textured_mesh(
     vertices, faces, uv = vertices[used], inverse.reshape(faces.shape), uv[used]
     if not np.all(np.isfinite(vertices)) or not np.all(np.isfinite(uv)):
         raise CorruptFile(source, "it has coordinates that are not finite")
-    if len(faces) > MAX_FACES:
-        raise InvalidInput(f"number of triangles of {source}", len(faces), f"at most {MAX_FACES}; simplify the mesh")
+    _check_count(len(faces), source)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     longest = float((high - low).max())
     if not MIN_LENGTH_M <= longest <= MAX_LENGTH_M:
@@ -554,6 +492,11 @@ def textured_mesh(
         uv=np.clip(uv, 0, 1).astype(np.float32),
         texture=texture if is_clean else clean_texture(texture, uv, faces),
     )
+
+
+def _check_count(faces: int, source: Path | str) -> None:
+    if faces > MAX_FACES:
+        raise InvalidInput(f"number of triangles of {source}", faces, f"at most {MAX_FACES}; simplify the mesh")
 
 
 def _weld(vertices: Float[np.ndarray, "P 3"]) -> tuple[Float[np.ndarray, "Q 3"], Int[np.ndarray, "P"]]:

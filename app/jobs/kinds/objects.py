@@ -114,8 +114,7 @@ def _plain(error: OsfError, new: NewObject, inputs: str) -> str:
         fitting = [unit for metres, unit in _UNITS if _LIKELY_M[0] <= raw * metres <= _LIKELY_M[1]]
         advice = f"choose the unit {fitting[0]}" if fitting else "choose another unit or scale"
         return f"The mesh is {_length(error.longest_m)} long, but it must be between 5 mm and 1 m; {advice}."
-    text = str(error).replace(f"{inputs}/unpacked/mesh.glb", "the uploaded mesh")
-    text = text.replace(f"{inputs}/unpacked/", "").replace(f"{inputs}/{UPLOAD}", "the uploaded file")
+    text = str(error).replace(f"{inputs}/{UPLOAD}", "the uploaded file")
     return text[:1].upper() + text[1:] if text.startswith("the ") else text
 
 

@@ -107,18 +107,20 @@ def _add_cameras(tree: dict[str, Any], cameras: tuple[Camera, ...]) -> None:
 
 
 def _add_materials(tree: dict[str, Any], *, is_unlit: bool) -> None:
-    """Give meshes with vertex colours a material; without one they would be polished metal."""
-    bare = [p for mesh in tree["meshes"] for p in mesh["primitives"] if "material" not in p]
-    if not bare:
-        return
-    materials = tree.setdefault("materials", [])
-    for primitive in bare:
-        primitive["material"] = len(materials)
-    material: dict[str, Any] = {"name": "vertex colours", "pbrMetallicRoughness": _MATTE}
+    """Give each mesh a material of its name: some readers join meshes whose materials are called alike.
+
+    Meshes with vertex colours have none yet; without one they would be polished metal.
+    """
+    bare: dict[str, Any] = {"pbrMetallicRoughness": _MATTE}
     if is_unlit:
-        material["extensions"] = {UNLIT_EXTENSION: {}}
+        bare["extensions"] = {UNLIT_EXTENSION: {}}
         tree["extensionsUsed"] = [*tree.get("extensionsUsed", ()), UNLIT_EXTENSION]
-    materials.append(material)
+    given, tree["materials"] = tree.get("materials", []), []
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            material = given[primitive["material"]] if "material" in primitive else bare
+            primitive["material"] = len(tree["materials"])
+            tree["materials"].append({**material, "name": mesh["name"]})
 
 
 # One place and one colour for each point of a field's surface, for formats without scattering functions.

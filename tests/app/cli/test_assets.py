@@ -1,12 +1,16 @@
 import json
+import zipfile
 
+import numpy as np
 import pytest
 import trimesh
 import tyro
+from PIL import Image
 
 from app.cli.assets import Assets, AssetsAdd, AssetsFetch, AssetsList
 from app.cli.command import Command
-from osfcore.errors import InvalidInput, UnknownName
+from osfcore.errors import CorruptFile, InvalidInput, UnknownName
+from osfcore.objects.asset_library import AssetLibrary
 from tests.support.errors import about
 
 
@@ -57,6 +61,27 @@ def test_add_shows_in_the_list(tmp_path, capsys):
     names = [r["name"] for r in AssetsList(data_dir=tmp_path / "data", json=True).run()["objects"]]
     assert names == sorted(names)
     assert "ball" in names
+
+
+def test_add_finds_files_as_the_page_does_and_names_what_is_missing(tmp_path):
+    box = trimesh.creation.box((0.1, 0.06, 0.04))
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + ["vt 0.5 0.5"]
+    lines += ["f " + " ".join(f"{corner + 1}/1" for corner in face) for face in box.faces]
+    (tmp_path / "box.obj").write_text("\n".join(["mtllib C:\\made\\BOX.MTL", "usemtl red", *lines]))
+    (tmp_path / "box.mtl").write_text("newmtl red\nmap_Kd -s 1 1 1 Paint.PNG\n")
+    add = AssetsAdd(tmp_path / "box.obj", name="box", data_dir=tmp_path / "data")
+    with pytest.raises(CorruptFile, check=about("Paint.PNG")):
+        add.run()
+    assert AssetLibrary(tmp_path / "data" / "objects").names() == ()
+    Image.new("RGB", (8, 8), (200, 30, 30)).save(tmp_path / "paint.png")
+    assert add.run()["available"]
+    with zipfile.ZipFile(tmp_path / "box.zip", "w") as archive:
+        for name in ("box.obj", "box.mtl", "paint.png"):
+            archive.write(tmp_path / name, f"box/{name}")
+    assert AssetsAdd(tmp_path / "box.zip", name="zipped", data_dir=tmp_path / "data").run()["available"]
+    for name in ("box", "zipped"):
+        texture = AssetLibrary(tmp_path / "data" / "objects").load(name).mesh.texture
+        assert np.all(texture == (200, 30, 30))
 
 
 @pytest.mark.slow

@@ -36,6 +36,15 @@ def add(archive, name, data=b"x", kind=stat.S_IFREG):
         file.writestr(info, data)
 
 
+@pytest.mark.parametrize(("name", "encoding"), [("m\u00e4t", "utf-8"), ("ma\u0308t", "utf-8"), ("m\u00e4t", "cp437")])
+def test_names_are_read_without_the_flag_of_utf_8(tmp_path, name, encoding):
+    path, coded = tmp_path / "set.zip", name.encode(encoding)
+    add(path, "train/anno.json")
+    add(path, "train/" + "?" * len(coded))
+    path.write_bytes(path.read_bytes().replace(b"?" * len(coded), coded))
+    assert left_in(unpack_set(path, tmp_path / "out") / "train") == ["anno.json", name]
+
+
 def left_in(folder):
     return sorted(path.name for path in folder.iterdir())
 

@@ -1,3 +1,7 @@
+import base64
+import json
+import zipfile
+
 import cv2
 import numpy as np
 import pytest
@@ -6,17 +10,22 @@ from PIL import Image
 
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.geometry.poses import quaternion_conjugate, rotate
-from osfcore.objects.mesh import (
-    WrongMeshSize,
-    clean_texture,
-    joined,
-    piece_of,
-    read_mesh,
-    read_msh,
-    resting_poses,
-    textured_mesh,
+from osfcore.objects.mesh import WrongMeshSize, clean_texture, read_mesh, read_msh, resting_poses, textured_mesh
+from tests.core.objects.meshes import (
+    BOX,
+    COLOURS,
+    CORNERS,
+    PALETTE,
+    SIDE,
+    STRIP,
+    UV,
+    encoded,
+    glb,
+    gltf,
+    msh_bytes,
+    obj,
+    ply,
 )
-from tests.core.objects.meshes import msh_bytes
 from tests.support.errors import about
 
 TEXTURE = np.full((8, 8, 3), 100, np.uint8)
@@ -127,73 +136,375 @@ def test_formats_agree_in_any_unit_and_glb_is_turned_upright(tmp_path, suffix):
 RNG = np.random.default_rng(3)
 
 
-def box() -> trimesh.Trimesh:
-    return trimesh.creation.box((0.1, 0.06, 0.04))
-
-
-def textured_box(colour, uv=None, size=(8, 8), factor=None) -> trimesh.Trimesh:
-    mesh = box()
-    image = Image.fromarray(np.broadcast_to(np.array(colour, np.uint8), (*size, 3)).copy())
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, baseColorFactor=factor)
-    uv = RNG.random((8, 2)) if uv is None else uv
-    mesh.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    return mesh
-
-
-def colours_on_faces(piece, weights):
+def colours_on_faces(mesh, weights):
     """Bilinear colours at one place of each face."""
-    uv = np.einsum("k,fkc->fc", weights, piece.uv[piece.faces])
-    height, width = piece.texture.shape[:2]
+    uv = np.einsum("k,fkc->fc", weights, mesh.uv[mesh.faces])
+    height, width = mesh.texture.shape[:2]
     x, y = (uv[:, 0] * width - 0.5).astype(np.float32), ((1 - uv[:, 1]) * height - 0.5).astype(np.float32)
-    return cv2.remap(piece.texture, x[None], y[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+    return cv2.remap(mesh.texture, x[None], y[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+
+
+def sides(mesh) -> np.ndarray:
+    """The colours of the middles of the sides of the box, in the order of `NAMES`."""
+    normals = mesh.normals[mesh.faces].mean(axis=1)
+    colours = colours_on_faces(mesh, np.full(3, 1 / 3)).astype(float)
+    axes = np.stack([np.eye(3), -np.eye(3)], axis=1).reshape(-1, 3)
+    return np.array([colours[normals @ axis > 0.9].mean(axis=0) for axis in axes])
+
+
+def turned(colours):
+    """Colours of sides as glTF names them, y up, by our axes, z up."""
+    return np.asarray(colours)[[0, 1, 5, 4, 2, 3]]
+
+
+def read_glb(folder, attributes, material=None, image=None, **tree):
+    path = folder / "mesh.glb"
+    path.write_bytes(glb(*gltf({"POSITION": CORNERS, **attributes}, material, image, **tree)))
+    return read_mesh(path)
+
+
+def srgb(linear):
+    return 255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def linear(shown):
+    return np.where(shown <= 0.04045 * 255, shown / 255 / 12.92, ((shown / 255 + 0.055) / 1.055) ** 2.4)
 
 
 @pytest.mark.parametrize("kind", ["vertex_colors", "face_colors"])
-def test_baked_colours_come_back_by_bilinear_sampling(kind):
-    mesh = box()
+def test_baked_colours_come_back_by_bilinear_sampling(tmp_path, kind):
+    box = trimesh.creation.box((0.1, 0.06, 0.04))
     colours = RNG.integers(0, 256, (8 if kind == "vertex_colors" else 12, 4)).astype(np.uint8)
-    setattr(mesh.visual, kind, colours)
-    piece = piece_of(mesh)
-    corners = colours[mesh.faces] if kind == "vertex_colors" else np.repeat(colours[:, None], 3, axis=1)
+    setattr(box.visual, kind, colours)
+    box.export(tmp_path / "box.ply")
+    mesh = read_mesh(tmp_path / "box.ply")
+    places = mesh.vertices[mesh.faces]
+    if kind == "vertex_colors":
+        nearest = np.linalg.norm(places[:, :, None] - box.vertices, axis=-1).argmin(axis=2)
+        corners = colours[nearest][..., :3].astype(float)
+    else:
+        nearest = np.linalg.norm(places.mean(axis=1)[:, None] - box.triangles_center, axis=-1).argmin(axis=1)
+        corners = np.repeat(colours[nearest][:, None, :3], 3, axis=1).astype(float)
     for weights in (np.array([1.0, 0, 0]), np.array([0.2, 0.5, 0.3]), np.array([0, 0.5, 0.5])):
-        expected = np.einsum("k,fkc->fc", weights, corners[..., :3].astype(float))
-        assert np.abs(colours_on_faces(piece, weights) - expected).max() < 8  # remap interpolates in steps of 1/32
+        expected = np.einsum("k,fkc->fc", weights, corners)
+        assert np.abs(colours_on_faces(mesh, weights) - expected).max() < 8  # remap interpolates in steps of 1/32
 
 
-def test_a_colour_factor_darkens_the_image_and_a_mesh_without_colours_is_grey():
-    piece = piece_of(textured_box((200, 100, 50), factor=[0.5, 1.0, 1.0, 1.0]))
-    np.testing.assert_allclose(piece.texture[0, 0], (100, 100, 50), atol=1)
-    assert len(np.unique(piece_of(box()).texture)) == 1
+BASE = {"baseColorTexture": {"index": 0}}
+BLACK = {"baseColorFactor": [0, 0, 0, 1]}
+IMAGE = {"pbrMetallicRoughness": BASE}
+GOLD = {"diffuseFactor": [0, 0, 0, 1], "specularFactor": [1, 0.8, 0.3]}
+GLOSS = {"diffuseFactor": [1, 0.2, 1, 1], "diffuseTexture": {"index": 0}}
 
 
-def test_joined_pieces_keep_their_colours():
-    colours = [(200, 10, 20), (20, 200, 10), (200, 10, 20)]
-    pieces = [piece_of(textured_box(c, size=s)) for c, s in zip(colours, [(8, 8), (32, 16), (8, 8)], strict=True)]
-    whole = joined(pieces)
-    assert len(whole.faces) == 36
-    got = colours_on_faces(whole, np.array([0.2, 0.3, 0.5])).reshape(3, 12, 3)
-    for piece, colour in zip(got, colours, strict=True):
-        assert np.abs(piece.astype(int) - colour).max() < 120  # at the seam of two images colours may mix
-        assert np.abs(np.median(piece, axis=0) - colour).max() <= 1
+@pytest.mark.parametrize(
+    ("attributes", "material", "has_image", "factor"),
+    [
+        ({}, None, False, (1, 1, 1)),
+        ({}, {"pbrMetallicRoughness": {"metallicFactor": 0}}, False, (1, 1, 1)),
+        ({}, {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.25, 0, 1]}}, False, (0.5, 0.25, 0)),
+        ({}, {"pbrMetallicRoughness": BASE | {"baseColorFactor": [0.5, 1, 1, 1]}}, True, (0.5, 1, 1)),
+        ({}, IMAGE | {"extensions": {"KHR_materials_unlit": {}}}, True, (1, 1, 1)),
+        ({}, {"extensions": {"KHR_materials_pbrSpecularGlossiness": GLOSS}}, True, (1, 0.2, 1)),
+        ({}, {"extensions": {"KHR_materials_pbrSpecularGlossiness": GOLD}}, False, (1, 0.8, 0.3)),
+        ({}, {"emissiveFactor": [1, 1, 0.5], "emissiveTexture": {"index": 0}}, True, (1, 1, 0.5)),
+        ({}, {"pbrMetallicRoughness": BLACK, "emissiveFactor": [1, 0.5, 0]}, False, (1, 0.5, 0)),
+        ({"COLOR_0": np.full((36, 4), 51, np.uint8)}, None, False, (0.2, 0.2, 0.2)),
+        ({"COLOR_0": np.full((36, 4), 13107, np.uint16)}, {"alphaMode": "BLEND"}, False, (0.2, 0.2, 0.2)),
+        ({"COLOR_0": np.full((36, 3), 0.2, np.float32)}, IMAGE, True, (0.2, 0.2, 0.2)),
+    ],
+)  # fmt: skip
+def test_colours_of_gltf_multiply_in_linear_light(tmp_path, attributes, material, has_image, factor):
+    mesh = read_glb(tmp_path, {"TEXCOORD_0": UV, **attributes}, material, encoded(STRIP) if has_image else None)
+    base = turned(PALETTE) if has_image else np.full((6, 3), 255)
+    np.testing.assert_allclose(sides(mesh), srgb(linear(base) * factor), atol=1)
 
 
-def test_repeated_textures_are_tiled():
-    base = RNG.random((8, 2))
+@pytest.mark.parametrize("material", [None, {"name": "vertex colours"}, {"pbrMetallicRoughness": {}}])
+def test_vertex_colours_of_gltf_stay_beside_a_material(tmp_path, material):
+    mesh = read_glb(tmp_path, {"COLOR_0": COLOURS}, material)
+    np.testing.assert_allclose(sides(mesh), turned(PALETTE), atol=1)
+
+
+def test_vertex_colours_shade_an_image_within_each_face(tmp_path):
+    shade = np.where(CORNERS[:, 1:2] > 0, 1, 0.25) * np.ones(3)
+    mesh = read_glb(tmp_path, {"TEXCOORD_0": UV, "COLOR_0": shade.astype(np.float32)}, IMAGE, encoded(STRIP))
+    for weights in np.array([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.3, 0.3, 0.4]]):
+        height = (mesh.vertices[mesh.faces][..., 2] > 0) @ weights
+        np.testing.assert_allclose(colours_on_faces(mesh, weights).max(axis=1), srgb(0.25 + 0.75 * height), atol=3)
+
+
+def wholes(fractions, kind):
+    return np.round(fractions * np.iinfo(kind).max).astype(kind)
+
+
+TRANSFORM = {"offset": [0.5, 0.25], "scale": [2, 0.5], "rotation": np.pi / 2}
+
+
+def transformed(uv):
+    """Coordinates that TRANSFORM brings back to the given ones."""
+    return np.column_stack([(0.25 - uv[:, 1]) / 2, (uv[:, 0] - 0.5) / 0.5]).astype(np.float32)
+
+
+def textured(**info):
+    return {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, **info}}}
+
+
+def extended(**values):
+    return textured(extensions={"KHR_texture_transform": values})
+
+
+ELSEWHERE = np.zeros((36, 2), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "material"),
+    [
+        ({"TEXCOORD_0": UV + 7}, textured()),
+        ({"TEXCOORD_0": wholes(UV, np.uint16)}, textured()),
+        ({"TEXCOORD_0": wholes(UV / 2, np.uint16)}, extended(scale=[2, 2])),
+        ({"TEXCOORD_0": transformed(UV)}, extended(**TRANSFORM)),
+        ({"TEXCOORD_0": ELSEWHERE, "TEXCOORD_1": UV}, textured(texCoord=1)),
+        ({"TEXCOORD_0": ELSEWHERE, "TEXCOORD_1": UV}, extended(texCoord=1)),
+    ],
+)
+def test_texture_coordinates_of_gltf_are_found_in_any_form(tmp_path, attributes, material):
+    mesh = read_glb(tmp_path, attributes, material, encoded(STRIP), extensionsRequired=["KHR_texture_transform"])
+    np.testing.assert_allclose(sides(mesh), turned(PALETTE), atol=1)
+
+
+@pytest.mark.parametrize(("wrap", "u"), [("REPEAT", UV[:, 0] - 3), ("MIRRORED", 2 - UV[:, 0]), ("CLAMP", UV[:, 0])])
+def test_textures_are_wrapped_as_their_sampler_says(tmp_path, wrap, u):
+    code = {"REPEAT": 10497, "MIRRORED": 33648, "CLAMP": 33071}[wrap]
+    uv = np.column_stack([u, UV[:, 1]]).astype(np.float32)
+    tables = {"samplers": [{"wrapS": code, "wrapT": 33071}], "textures": [{"source": 0, "sampler": 0}]}
+    mesh = read_glb(tmp_path, {"TEXCOORD_0": uv}, IMAGE, encoded(STRIP), **tables)
+    np.testing.assert_allclose(sides(mesh), turned(PALETTE), atol=1)
+
+
+def test_quantised_positions_and_nested_nodes(tmp_path):
+    nodes = [{"children": [1], "translation": [5, 0, 0]}, {"mesh": 0, "scale": [0.1 / 32767] * 3}]
+    positions = np.round(CORNERS / 0.1 * 32767).astype(np.int16)
+    packed = np.zeros((36, 4), np.int16)
+    packed[:, :3] = positions
+    description, buffer = gltf({"POSITION": CORNERS, "COLOR_0": COLOURS}, nodes=nodes)
+    description["bufferViews"].append(
+        {"buffer": 0, "byteOffset": len(buffer), "byteLength": packed.nbytes, "byteStride": 8}
+    )
+    description["accessors"][0] |= {"bufferView": 2, "componentType": 5122}
+    (tmp_path / "a.glb").write_bytes(glb(description, buffer + packed.tobytes()))
+    mesh = read_mesh(tmp_path / "a.glb")
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), (0.1, 0.04, 0.06), atol=1e-5)
+    description["accessors"][0]["normalized"] = True
+    nodes[1]["scale"] = [0.1] * 3
+    (tmp_path / "a.glb").write_bytes(glb(description, buffer + packed.tobytes()))
+    mesh = read_mesh(tmp_path / "a.glb")
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), (0.1, 0.04, 0.06), atol=1e-5)
+    np.testing.assert_allclose(sides(mesh), turned(PALETTE), atol=1)
+
+
+def test_a_sparse_accessor_replaces_some_numbers(tmp_path):
+    description, buffer = gltf({"POSITION": CORNERS, "COLOR_0": np.zeros((36, 3), np.float32)})
+    changed = np.flatnonzero(SIDE == 0).astype(np.uint16)
+    values = np.repeat(np.float32([[0, 1, 0]]), len(changed), axis=0)
+    for data in (changed, values):
+        view = {"buffer": 0, "byteOffset": len(buffer), "byteLength": data.nbytes}
+        description["bufferViews"].append(view)
+        buffer += data.tobytes() + bytes(-data.nbytes % 4)
+    indices, view = {"bufferView": 2, "componentType": 5123}, {"bufferView": 3}
+    description["accessors"][1]["sparse"] = {"count": len(changed), "indices": indices, "values": view}
+    (tmp_path / "a.glb").write_bytes(glb(description, buffer))
+    np.testing.assert_allclose(sides(read_mesh(tmp_path / "a.glb")), turned([[0, 255, 0], *[[0, 0, 0]] * 5]), atol=1)
+
+
+@pytest.mark.parametrize(("mode", "order"), [(5, [0, 1, 2, 3, 2, 1]), (6, [0, 1, 3, 2])], ids=["strip", "fan"])
+def test_strips_and_fans_are_triangles(tmp_path, mode, order):
+    corners = np.float32([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.02], [0.1, 0.1, 0]])[order]
+    description, buffer = gltf({"POSITION": corners})
+    description["meshes"][0]["primitives"][0]["mode"] = mode
+    (tmp_path / "a.glb").write_bytes(glb(description, buffer))
+    mesh = read_mesh(tmp_path / "a.glb")
+    areas = np.linalg.norm(np.cross(*np.diff(mesh.vertices[mesh.faces], axis=1).transpose(1, 0, 2)), axis=1) / 2
+    assert len(mesh.faces) >= 2
+    assert areas.max() < 0.0075
+
+
+@pytest.mark.parametrize("is_embedded", [True, False])
+def test_gltf_with_its_buffer_and_image_outside(tmp_path, is_embedded):
+    description, buffer = gltf({"POSITION": CORNERS, "TEXCOORD_0": UV}, IMAGE, encoded(STRIP))
+    uris = {"scene.bin": buffer, "textures/my t\u00e4x.png": encoded(STRIP)}
+    if is_embedded:
+        addresses = [f"data:application/octet-stream;base64,{base64.b64encode(d).decode()}" for d in uris.values()]
+    else:
+        addresses = ["scene.bin", "textures/my%20t%C3%A4x.png"]
+        (tmp_path / "textures").mkdir()
+        for name, data in uris.items():
+            (tmp_path / name).write_bytes(data)
+    description["buffers"], description["images"] = [{"uri": addresses[0]}], [{"uri": addresses[1]}]
+    (tmp_path / "scene.gltf").write_text(json.dumps(description))
+    np.testing.assert_allclose(sides(read_mesh(tmp_path / "scene.gltf")), turned(PALETTE), atol=1)
+
+
+@pytest.mark.parametrize(
+    ("required", "word"),
+    [
+        ("KHR_draco_mesh_compression", "Draco"),
+        ("EXT_meshopt_compression", "Meshopt"),
+        ("KHR_texture_basisu", "KTX2"),
+        ("EXT_mesh_gpu_instancing", "EXT_mesh_gpu_instancing"),
+    ],
+)
+def test_what_a_gltf_needs_and_nobody_reads_is_named(tmp_path, required, word):
+    with pytest.raises(CorruptFile, check=about(word)):
+        read_glb(tmp_path, {}, extensionsRequired=[required])
+
+
+def test_compressed_triangles_and_damaged_images_are_refused(tmp_path):
+    description, buffer = gltf({"POSITION": CORNERS})
+    del description["accessors"][0]["bufferView"]
+    for used, word in (([], "compressed"), (["KHR_draco_mesh_compression"], "Draco")):
+        (tmp_path / "a.glb").write_bytes(glb(description | {"extensionsUsed": used}, buffer))
+        with pytest.raises(CorruptFile, check=about(word)):
+            read_mesh(tmp_path / "a.glb")
+    with pytest.raises(CorruptFile, check=about("texture")):
+        read_glb(tmp_path, {"TEXCOORD_0": UV}, IMAGE, b"\x89PNG\r\n\x1a\n and no more")
+
+
+@pytest.mark.parametrize("image", [None, encoded(np.full((8, 8, 3), (10, 200, 30)))])
+def test_coordinates_do_not_matter_where_there_is_one_colour(tmp_path, image):
+    material = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]} | (BASE if image else {})}
+    mesh = read_glb(tmp_path, {"TEXCOORD_0": UV * 70000}, material, image)
+    np.testing.assert_allclose(sides(mesh), [(10, 200, 30) if image else (255, 255, 255)] * 6, atol=1)
+
+
+@pytest.mark.parametrize(("texels_each", "place"), [(1, 0.5), (4, 0.4)])
+def test_sides_that_take_one_colour_each_of_a_palette_keep_it(tmp_path, texels_each, place):
+    palette = np.repeat(PALETTE[None], texels_each, axis=1)
+    uv = np.column_stack([(SIDE + place) / 6, np.full(36, 0.5)]).astype(np.float32)
+    mesh = read_glb(tmp_path, {"TEXCOORD_0": uv}, IMAGE, encoded(palette))
+    np.testing.assert_allclose(sides(mesh), turned(PALETTE), atol=1)
+
+
+def test_repeated_textures_are_tiled(tmp_path):
     ramp = np.zeros((16, 16, 3), np.uint8)
     ramp[..., 0] = np.arange(16) * 15
-    mesh = textured_box((0, 0, 0), uv=base * 2.5 - 0.7)
-    mesh.visual.material.baseColorTexture = Image.fromarray(ramp)
-    piece = piece_of(mesh)
-    assert piece.uv.min() >= 0
-    assert piece.uv.max() <= 1
-    u = (base * 2.5 - 0.7)[mesh.faces].mean(axis=1)[:, 0]
-    got = colours_on_faces(piece, np.full(3, 1 / 3))[:, 0]
-    expected = (u % 1) * 240 - 7.5
-    inner = (u % 1 > 0.1) & (u % 1 < 0.9)  # near the wrap the ramp jumps
+    uv = (CORNERS[:, :2] * 25 - 0.7).astype(np.float32)  # 2.5 times along x
+    mesh = read_glb(tmp_path, {"TEXCOORD_0": uv}, IMAGE, encoded(ramp))
+    assert 0 <= mesh.uv.min() <= mesh.uv.max() <= 1
+    u = (mesh.vertices[mesh.faces].mean(axis=1)[:, 0] * 25 - 0.7) % 1
+    got = colours_on_faces(mesh, np.full(3, 1 / 3))[:, 0]
+    is_spread = np.abs(mesh.normals[mesh.faces].mean(axis=1)[:, 1]) > 0.9  # on the others the texture is a line
+    inner = is_spread & (u > 0.1) & (u < 0.9)  # near the wrap the ramp jumps
     assert inner.any()
-    np.testing.assert_allclose(got[inner], expected[inner], atol=8)
-    with pytest.raises(InvalidInput, check=about("repetitions")):
-        piece_of(textured_box((1, 2, 3), uv=base * 50))
+    np.testing.assert_allclose(got[inner], u[inner] * 240 - 7.5, atol=8)
+    with pytest.raises(InvalidInput, check=about("repeats")):
+        read_glb(tmp_path, {"TEXCOORD_0": uv * 1000}, IMAGE, encoded(ramp))
+
+
+def put(folder, files):
+    """Write files of an OBJ; return the OBJ."""
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    return folder / next(iter(files))
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd t.png\n", "t.png": encoded(STRIP)},
+        {"a.obj": obj(), "M.MTL": "newmtl a\nKd 0 0 0\nmap_kd T.PNG\n", "t.png": encoded(STRIP)},
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd -s 1 1 1 -o 0 0 0 -bm 1 t.png\n", "t.png": encoded(STRIP)},
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd -clamp on -s 1 1 my t.png\n", "my t.png": encoded(STRIP)},
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd C:\\x\\T.png\n", "tex/t.png": encoded(STRIP)},
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd t\u00e4.png\n", "ta\u0308.png": encoded(STRIP)},
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd t\u00e4.tif\n".encode("cp1252"),
+         "t\u00e4.tif": encoded(STRIP, "TIFF")},
+        {"a.obj": obj(head="# mtllib x\nmtllib m.mtl n.mtl\nusemtl a\n"), "n.mtl": "newmtl a\nmap_Kd t.png\n",
+         "m.mtl": "newmtl b\n", "t.png": encoded(STRIP)},
+        {"a.obj": "\ufeff" + obj().replace("\n", "\r").replace(" ", "\t"), "m.mtl": "newmtl a\rmap_Kd t.png\r",
+         "t.png": encoded(STRIP)},
+    ],
+    ids=["plain", "case", "options", "spaces", "windows", "decomposed", "cp1252", "two libraries", "cr"],
+)  # fmt: skip
+def test_textures_of_obj_are_found_as_programs_name_them(tmp_path, files):
+    np.testing.assert_allclose(sides(read_mesh(put(tmp_path, files))), PALETTE, atol=1)
+
+
+def test_scale_and_offset_of_a_texture_of_obj_are_honoured(tmp_path):
+    library, uv = "newmtl a\nmap_Kd -s 2 1 1 -o 0.25 0 t.png\n", np.column_stack([(UV[:, 0] - 0.25) / 2, UV[:, 1]])
+    path = put(tmp_path, {"a.obj": obj(uv=uv), "m.mtl": library, "t.png": encoded(STRIP)})
+    np.testing.assert_allclose(sides(read_mesh(path)), PALETTE, atol=1)
+
+
+@pytest.mark.parametrize(
+    ("library", "factor"), [("Kd 1 1 1", (1, 1, 1)), ("Kd 0.5 1 1", (0.5, 1, 1)), ("Ka 1 1 1", (1, 1, 1))]
+)
+def test_vertex_colours_of_obj_are_multiplied_by_their_material(tmp_path, library, factor):
+    for top in (1, 255):
+        path = put(tmp_path, {"a.obj": obj(COLOURS / 255 * top), "m.mtl": f"newmtl a\n{library}\n"})
+        np.testing.assert_allclose(sides(read_mesh(path)), PALETTE * factor, atol=1)
+
+
+def test_each_material_of_an_obj_keeps_its_colour(tmp_path):
+    lines = obj(head="mtllib m.mtl\n").splitlines()
+    faces = [f"usemtl m{SIDE[3 * i]}\n{line}" for i, line in enumerate(line for line in lines if line[0] == "f")]
+    text = "\n".join([line for line in lines if line[0] != "f"] + faces)
+    library = "".join(f"newmtl m{i}\nKd {r / 255} {g / 255} {b / 255}\n" for i, (r, g, b) in enumerate(PALETTE[:5]))
+    library += "newmtl m5\nmap_Kd t.png\n"
+    path = put(tmp_path, {"a.obj": text, "m.mtl": library, "t.png": encoded(STRIP)})
+    np.testing.assert_allclose(sides(read_mesh(path)), PALETTE, atol=1)
+
+
+def test_negative_indices_of_obj_count_back_from_where_they_stand(tmp_path):
+    parts = [
+        "".join(f"v {x:f} {y:f} {z:f}\n" for x, y, z in CORNERS[i : i + 3]) + "f -3 -2 -1\n" for i in range(0, 36, 3)
+    ]
+    (tmp_path / "a.obj").write_text("".join(parts))
+    np.testing.assert_allclose(np.ptp(read_mesh(tmp_path / "a.obj").vertices, axis=0), (0.1, 0.06, 0.04), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("files", "missing"),
+    [
+        ({"a.obj": obj()}, "m.mtl"),
+        ({"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd -s 1 1 1 C:\\x\\lost.png\n"}, "lost.png"),
+        ({"a.ply": ply().replace(b"element vertex", b"comment TextureFile lost.png\nelement vertex")}, "lost.png"),
+        ({"a.gltf": json.dumps(gltf({"POSITION": CORNERS}, buffers=[{"uri": "lost.bin"}])[0])}, "lost.bin"),
+    ],
+)
+def test_what_is_missing_beside_a_mesh_is_named(tmp_path, files, missing):
+    with pytest.raises(CorruptFile, check=about(missing)):
+        read_mesh(put(tmp_path, files))
+
+
+@pytest.mark.parametrize("is_binary", [False, True])
+@pytest.mark.parametrize("line_end", ["\n", "\r\n", "\r"])
+def test_ply_with_any_line_ends_keeps_its_colours(tmp_path, line_end, is_binary):
+    (tmp_path / "a.ply").write_bytes(ply(line_end, is_binary))
+    np.testing.assert_allclose(sides(read_mesh(tmp_path / "a.ply")), PALETTE, atol=1)
+
+
+@pytest.mark.parametrize("is_magics", [False, True])
+def test_colours_of_binary_stl(tmp_path, is_magics):
+    red, green, blue = (COLOURS[::3] >> 3).astype(int).T
+    faces = np.zeros(12, [("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
+    faces["v"] = CORNERS.reshape(-1, 3, 3)
+    faces["a"] = (red | green << 5 | blue << 10) if is_magics else (0x8000 | blue | green << 5 | red << 10)
+    head = b"COLOR=\x80\x80\x80\xff" if is_magics else b"made by hand"
+    (tmp_path / "a.stl").write_bytes(head.ljust(80) + np.uint32(12).tobytes() + faces.tobytes())
+    np.testing.assert_allclose(sides(read_mesh(tmp_path / "a.stl")), PALETTE, atol=1)
+
+
+def test_a_zip_is_read_as_its_mesh_and_stays(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("d/without_colours.ply", BOX.export(file_type="ply"))
+        for name, content in {"d/a.obj": obj(), "d/m.mtl": "newmtl a\nmap_Kd t.png\n", "t.png": encoded(STRIP)}.items():
+            archive.writestr(name, content)
+    np.testing.assert_allclose(sides(read_mesh(tmp_path / "a.zip")), PALETTE, atol=1)
+    (tmp_path / "b.zip").write_bytes(glb(*gltf({"POSITION": CORNERS, "COLOR_0": COLOURS})))
+    np.testing.assert_allclose(sides(read_mesh(tmp_path / "b.zip")), turned(PALETTE), atol=1)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.zip", "b.zip"}
 
 
 SQUARE_UV = np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])
@@ -230,7 +541,7 @@ def test_a_chart_thinner_than_its_rim_keeps_a_colour():
 
 @pytest.mark.parametrize("normals", [(), np.ones((8, 3))])
 def test_msh_files_are_read_with_v_upwards_and_refused_if_truncated_or_without_uv_or_texture(tmp_path, normals):
-    path, uv, solid = tmp_path / "a.msh", np.random.default_rng(0).random((8, 2)), box()
+    path, uv, solid = tmp_path / "a.msh", np.random.default_rng(0).random((8, 2)), BOX.copy()
     whole = msh_bytes(solid.vertices, uv, solid.faces, normals)
     path.write_bytes(whole)
     with pytest.raises(CorruptFile, check=about("a.png")):

@@ -17,6 +17,8 @@ from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.io.scene_file import Scene
+from osfcore.objects.mesh import read_mesh
+from tests.support.ellipsoid import ALBEDO, HALF
 
 MUSTARD, GELATIN = "006_mustard_bottle", "009_gelatin_box"
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from glTF's axes to ours
@@ -52,6 +54,9 @@ def test_everything_stands_where_the_scene_says_with_y_up_and_its_texture(scene,
     np.testing.assert_allclose(read.geometry["table"].extents, [1.2, 1.2, 0], atol=1e-6)
     image = np.asarray(read.geometry[MUSTARD].visual.material.baseColorTexture, float)
     assert np.abs(image - mesh.texture).mean() < 4  # of 255; JPEG
+    tree = tree_of(content)
+    materials = [tree["materials"][p["material"]]["name"] for m in tree["meshes"] for p in m["primitives"]]
+    assert sorted(materials) == sorted(read.geometry)  # open3d joins meshes whose materials have one name
 
 
 @given(st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.2, 1)))
@@ -109,6 +114,16 @@ def test_a_field_s_surface_has_its_colours(is_lit, light, solid, assert_solid, o
     (material,) = tree_of(content)["materials"]
     assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
     assert ("KHR_materials_unlit" in material.get("extensions", {})) == is_lit
+
+
+def test_a_field_that_is_exported_and_read_again_keeps_its_shape_and_colours(solid, tmp_path, one_thread):
+    (tmp_path / "solid.glb").write_bytes(field_glb(solid, "solid"))
+    mesh = read_mesh(tmp_path / "solid.glb")
+    height, width = mesh.texture.shape[:2]
+    texels = np.stack([(1 - mesh.uv[:, 1]) * height, mesh.uv[:, 0] * width]).astype(int)
+    assert np.linalg.norm(mesh.vertices / HALF, axis=1) == pytest.approx(1, abs=0.05)
+    error = mesh.texture[*texels] / 255 - np.array(ALBEDO)
+    assert np.sqrt((error**2).mean()) < 0.03
 
 
 def test_the_surface_of_a_trained_field_is_that_of_the_scanned_mesh(library, one_thread):
