@@ -27,7 +27,8 @@ from app.processes.messages.photo_messages import CameraSource, Mark, Points, St
 from app.storage.records import MarkedObject, TablePhoto
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.photo.board import Board, board_pdf
-from osfcore.photo.calibration import MOST_PHOTOS, CalibrationJson, board_place, calibration_to_json, known_camera
+from osfcore.photo.calibration import MOST_PHOTOS, CalibrationJson, board_place, calibration_to_json
+from osfcore.photo.camera_files import known_camera
 from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, TableSource
 
 

@@ -17,6 +17,7 @@ from osfcore.io.files import write_atomically, write_json, writing
 from osfcore.io.json_codec import encode
 from osfcore.photo import calibration
 from osfcore.photo.board import Board, board_pdf
+from osfcore.photo.camera_files import read_camera
 from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
 from osfcore.photo.segmentation import Box, propose_mask
 from osfcore.random_streams import Stream, stream_rng
@@ -111,7 +112,7 @@ class PhotoEstimate(DataCommand):
     focal: float | None = None
     """Focal length in pixels; by default that of the board or the camera."""
     camera: Path | None = None
-    """What 'osf photo calibrate' has written about the camera that took the photos."""
+    """The camera that took the photos, from 'osf photo calibrate', ROS, OpenCV, Kalibr or RealSense, or K as .txt."""
     images: Path | None = None
     """Folder for a picture of each object: photo, outlines of mask and object, the object as found."""
     seed: int = 0
@@ -153,7 +154,7 @@ class PhotoEstimate(DataCommand):
         from osfcore.photo.summary import locate, locate_calibrated
 
         self._check_counts()
-        camera = None if self.camera is None else calibration.read_camera(self.camera)
+        camera = None if self.camera is None else read_camera(self.camera)
         raws = [read_photograph(path) for path in self.photo]
         boxes: list[dict[str, Box]] = [{} for _ in raws]
         for text in self.boxes:

@@ -14,16 +14,8 @@ from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.io.files import write_json
 from osfcore.io.scene_file import camera_from_json
 from osfcore.photo.board import planar_pose
-from osfcore.photo.calibration import (
-    assess,
-    board_place,
-    calibrated_camera,
-    calibration_to_json,
-    known_camera,
-    read_camera,
-    sight,
-    workspace_grid,
-)
+from osfcore.photo.calibration import assess, board_place, calibrated_camera, calibration_to_json, sight, workspace_grid
+from osfcore.photo.camera_files import known_camera, read_camera
 from osfcore.photo.read_photograph import RawPhotograph
 from osfcore.photo.summary import locate, locate_calibrated
 from tests.support.boards import RADIAL, SIZE, VARIED, K, on_table, project, sighting, sightings
