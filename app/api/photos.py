@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Res
 from pydantic import BaseModel, Field, FiniteFloat
 from starlette.concurrency import run_in_threadpool
 
-from app.api.bodies import JPEG, PNG, BoundedRoute, OpenFile, is_photo, kind_of, upload, whole_body
+from app.api.bodies import JPEG, PNG, BoundedRoute, OpenFile, is_photo, kind_of, refuse_form, upload, whole_body
 from app.api.dependencies import Services, ServicesDep, slow
 from app.api.goals import GoalOut
 from app.api.jobs import JobOut
@@ -300,6 +300,7 @@ async def _photo_body(request: Request, max_bytes: int) -> bytes:
     Raises:
         HTTPException: if it is none, or the upload broke off.
     """
+    refuse_form(request, "image/jpeg, or of another picture")
     if not is_photo(kind_of(request)):
         raise HTTPException(415, "Send a photo, such as a JPEG or PNG file.")
     return await whole_body(request, max_bytes)

@@ -60,7 +60,7 @@ AZURE |= dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), RATIONAL, st
 REALSENSE = {"width": 640, "height": 480, "ppx": CX, "ppy": CY, "fx": FX, "fy": FY, "coeffs": [0.0] * 5}
 CASES = {
     "ros1.yaml": (ROS.replace("MODEL", "plumb_bob").replace("DATA", str(list(D))), D, False, SIZE),
-    "small.yaml": (ROS.replace("MODEL", "plumb_bob").replace("DATA", "[-1e-05, 0, 0, 0]"), (-1e-5, 0, 0, 0), False, SIZE),
+    "e.yaml": (ROS.replace("MODEL", "plumb_bob").replace("DATA", "[-1e-05, 0, 0, 0]"), (-1e-5, 0, 0, 0), False, SIZE),
     "fisheye.yaml": (ROS.replace("MODEL", "equidistant").replace("DATA", str([*WIDE, 0.0])), WIDE, True, SIZE),
     "ros2.yml": (ECHO, RATIONAL, False, SIZE),
     "camchain.yaml": (KALIBR, WIDE, True, SIZE),
@@ -68,7 +68,7 @@ CASES = {
     "commas.txt": (",".join(map(str, LINE)), (), False, None),
     "realsense.json": ({**REALSENSE, "model": "distortion.inverse_brown_conrady"}, (), False, SIZE),
     "azure.json": ({"width": 640, "height": 480, "intrinsics": {"parameters": AZURE}}, RATIONAL, False, SIZE),
-    "bop.json": ({"cx": CX, "cy": CY, "depth_scale": 1, "fx": FX, "fy": FY, "height": 480, "width": 640}, (), False, SIZE),
+    "bop.json": ({"cx": CX, "cy": CY, "fx": FX, "fy": FY, "height": 480, "width": 640}, (), False, SIZE),
     "happypose.json": ({"K": ROWS, "resolution": [480, 640]}, (), False, SIZE),
     "open3d.json": ({"width": 640, "height": 480, "intrinsic_matrix": K.T.ravel().tolist()}, (), False, SIZE),
     "lists.json": ({"camera_matrix": ROWS, "distCoeffs": [list(D)], "imageSize": [640, 480]}, D, False, SIZE),
