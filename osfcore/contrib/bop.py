@@ -728,7 +728,8 @@ def read_bop_scene(
     placed = tuple(replace(image.camera, T_world_camera=pose) for image, pose in zip(images, cameras, strict=True))
     pictures = np.stack([image.picture for image in images])
     masks = np.stack([[image.masks.get(name, hidden) for name in names] for image in images])
-    observation = Observation(placed, pictures, names, masks, None, 0.0)
+    unmasked = np.array([[name in image.unmasked for name in names] for image in images])
+    observation = Observation(placed, pictures, names, masks, None, 0.0, unmasked if unmasked.any() else None)
     return BopScene(observation, poses, left_out, missing_parts(every))
 
 

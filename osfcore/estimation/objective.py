@@ -370,6 +370,7 @@ class ObservedViews:
         pusher: centre of the pusher [m], or None.
         quality: of what is rendered to compare with.
         only: pixels that count, where not all do.
+        unmasked: which of the masks nobody drew, if there are such.
     """
 
     cameras: tuple[Camera, ...]
@@ -378,6 +379,7 @@ class ObservedViews:
     pusher: Float[np.ndarray, "3"] | None
     quality: Quality = QUALITY
     only: Bool[np.ndarray, "V h w"] | None = None
+    unmasked: Bool[np.ndarray, "V N"] | None = None
 
 
 def views_of(observation: Observation, side: int, *, samples: int = 1) -> ObservedViews:
@@ -397,7 +399,8 @@ def views_of(observation: Observation, side: int, *, samples: int = 1) -> Observ
     if masks is not None:
         masks = np.stack([[_resize(mask, size) for mask in view] for view in masks.astype(np.float32)])
         masks = masks.reshape(len(cameras), len(observation.names), size[1], size[0])
-    return ObservedViews(cameras, images, masks, observation.pusher, replace(QUALITY, samples_per_side=samples))
+    quality = replace(QUALITY, samples_per_side=samples)
+    return ObservedViews(cameras, images, masks, observation.pusher, quality, unmasked=observation.unmasked)
 
 
 def _resize(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h w *c"]:

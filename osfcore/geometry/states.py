@@ -92,6 +92,7 @@ class Observation:
         masks: visible pixels of each object, or None.
         pusher: centre of the pusher [m]; the robot knows its hand.
         time_s: since the last reset [s].
+        unmasked: which of the masks nobody drew; None if all are there, so that an empty one means a hidden object.
     """
 
     cameras: tuple[Camera, ...]
@@ -100,6 +101,7 @@ class Observation:
     masks: Bool[np.ndarray, "V N h w"] | None
     pusher: Float[np.ndarray, "3"] | None
     time_s: float
+    unmasked: Bool[np.ndarray, "V N"] | None = None
 
 
 def pose_rows(poses: Pose) -> Float[np.ndarray, "N 7"]:

@@ -159,6 +159,7 @@ def test_images_without_annotation_are_left_out_and_missing_masks_told(folder, r
     (folder / "mask_visib" / "000006_000001.png").unlink()
     found = read_bop_scene(folder, LINEAR)
     assert [camera.name for camera in found.observation.cameras] == ["3", "6", "12"]
+    assert found.observation.unmasked.tolist() == [[False, False], [False, True], [False, False]]
     assert [note for note in found.notes if "Image 9" in note and "annotation" in note]
     assert [note for note in found.notes if "Image 6" in note and NAMES[1] in note]
     for mask in (folder / "mask_visib").iterdir():
