@@ -119,6 +119,12 @@ _TURNS: dict[str, tuple[tuple[float, float, float, float], _Shift]] = {
 }
 
 
+_DOPE = {  # what the networks that its authors published call objects
+    "cracker": "003_cracker_box", "gelatin": "009_gelatin_box", "meat": "010_potted_meat_can",
+    "mustard": "006_mustard_bottle", "soup": "005_tomato_soup_can", "sugar": "004_sugar_box",
+}  # fmt: skip
+
+
 def in_object_frame(pose: Pose, name: str, frame: ModelFrame) -> Pose:
     """Return `T_camera_object`, in the frame of the box's centre, of a pose in one of the other frames.
 
@@ -278,13 +284,12 @@ def _of_happypose(entries: list[_HappyposeJson], names: tuple[str, ...]) -> dict
 
 
 def _known_as(label: str, names: Collection[str]) -> str:
-    """Return our name of another program's class ("cracker" or "003_cracker_box_16k"); the class if there is none."""
+    """Return our name of another program's class, such as "003_cracker_box_16k"; the class itself if there is none."""
+    if label in _DOPE:
+        return _DOPE[label]
     plain = _plain(label.removesuffix("_16k"))
-    for known in (names, NAMES):
-        alike = [name for name in known if plain and plain in _plain(name)]
-        if len(alike) == 1:
-            return alike[0]
-    return label
+    alike = (name for name in (*names, *NAMES) if plain in (_plain(name), _plain(name).lstrip("0123456789")))
+    return next(alike, label)
 
 
 def _plain(name: str) -> str:

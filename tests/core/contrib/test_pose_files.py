@@ -124,10 +124,10 @@ def test_poses_of_dope_are_turned_into_the_frame_of_the_object(tmp_path, label):
     rows = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
     there = {"location": (100 * POSE.position).tolist(), "quaternion_xyzw": xyzw(POSE.quaternion), "visibility": 1}
     ours = quaternion_to_matrix(POSE.quaternion) @ rows.T
-    other = {**DOPE, "class": "AlphabetSoup"}
+    other = {**DOPE, "class": "Mustard"}  # that of HOPE, a toy
     path = write(tmp_path, "000.json", {"camera_data": {}, "objects": [{"class": label, **there}, other]})
     found = read_poses(path)
-    assert set(found) == {"003_cracker_box", "AlphabetSoup"}
+    assert set(found) == {"003_cracker_box", "Mustard"}
     np.testing.assert_allclose(quaternion_to_matrix(found["003_cracker_box"].quaternion), ours, atol=1e-4)
     np.testing.assert_allclose(found["003_cracker_box"].position, POSE.position, atol=1e-4)
     assert same(read_poses(path, PoseChoice(frame="bop"))["003_cracker_box"], POSE)
