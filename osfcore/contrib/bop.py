@@ -638,15 +638,13 @@ def _extents(image: BopImage, name: str) -> tuple[float, float]:
 
 def missing_parts(images: Sequence[BopImage]) -> tuple[str, ...]:
     """Return sentences about what images of a scene lack, or show several times."""
-    found = []
+    found: dict[str, list[str]] = {}
     for image in images:
-        if not image.poses and not image.twice:
-            found.append(f"Image {image.number} has no annotation of an object.")
-        for name in image.unmasked:
-            found.append(f"Image {image.number} has no file of the mask of {name}.")
-        for name in image.twice:
-            found.append(f"Image {image.number} shows {name} several times.")
-    return tuple(found)
+        parts = [] if image.poses or image.twice else ["without annotation of an object"]
+        parts += [f"without the file of the mask of {name}" for name in image.unmasked]
+        for part in (*parts, *(f"with {name} several times" for name in image.twice)):
+            found.setdefault(part, []).append(str(image.number))
+    return tuple(f"Image{'s' * (len(numbers) > 1)} {', '.join(numbers)}: {part}." for part, numbers in found.items())
 
 
 # A scene of a BOP data set as an observation over a table, and the annotated poses beside it.

@@ -78,6 +78,19 @@ def test_a_photograph_is_straightened_and_placed_as_calibrated(camera_json, raw)
         locate(blank, 1.0)
 
 
+@pytest.mark.slow
+def test_a_photograph_is_straightened_by_the_camera_of_another_program(raw, tmp_path):
+    sent = 4 * K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 3]]
+    (tmp_path / "camera_info.yaml").write_text(
+        f"image_width: {4 * SIZE[0]}\nimage_height: {4 * SIZE[1]}\ndistortion_model: plumb_bob\n"
+        f"camera_matrix: {{rows: 3, cols: 3, data: {sent.ravel().tolist()}}}\n"
+        f"distortion_coefficients: {{rows: 1, cols: 5, data: [{RADIAL}, 0, 0, 0, 0]}}\n"
+    )
+    located = locate_calibrated(raw, read_camera(tmp_path / "camera_info.yaml"))
+    np.testing.assert_allclose(located.T_world_camera.matrix(), POSE.matrix(), atol=2e-3)
+    np.testing.assert_allclose(located.intrinsics, K, atol=1e-9)
+
+
 def test_corners_are_in_pixels_of_the_photograph_as_it_was_sent(raw):
     expected = 4 * sighting("table.jpg", POSE.inverse()).points_px
     assert np.abs(sight(raw, "table.jpg").points_px - expected).max() < 4 * 0.1
