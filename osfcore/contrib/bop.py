@@ -66,6 +66,7 @@ _YCBV: tuple[tuple[str, _Size | None], ...] = (  # the box of each object [mm]; 
 )
 NAMES: tuple[str, ...] = tuple(name for name, _ in _YCBV)
 _MOST_OTHER, _MOST_OTHER_MM = 0.2, 5.0  # by which a side may differ; the wood block's do by 13 mm
+NUMBERED = re.compile(r"object -?\d+")  # the name of an object of which only the number is known
 _WHOSE = 'obj_id seems to count another data set\'s objects; give each its "name" in models_info.json'
 
 
@@ -641,6 +642,7 @@ def missing_parts(images: Sequence[BopImage]) -> tuple[str, ...]:
     found: dict[str, list[str]] = {}
     for image in images:
         parts = [] if image.poses or image.twice else ["without annotation of an object"]
+        parts += [f"with {name}, whose name nothing says" for name in image.poses if NUMBERED.fullmatch(name)]
         parts += [f"without the file of the mask of {name}" for name in image.unmasked]
         for part in (*parts, *(f"with {name} several times" for name in image.twice)):
             found.setdefault(part, []).append(str(image.number))

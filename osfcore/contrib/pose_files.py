@@ -30,6 +30,7 @@ from scipy.io import loadmat
 from osfcore.contrib.bop import (
     MAX_BYTES,
     NAMES,
+    NUMBERED,
     BopRow,
     annotated_rows,
     before_camera,
@@ -219,7 +220,7 @@ def read_poses(path: Path, choice: PoseChoice | None = None) -> dict[str, Pose]:
         raise CorruptFile(shown(path), f"poses come in {_KINDS}")
     frame = choice.frame or frame
     if frame != "bop":  # nobody knows where the origin of an object without a name is
-        poses = {name: pose for name, pose in poses.items() if not re.fullmatch(r"object -?\d+", name)}
+        poses = {name: pose for name, pose in poses.items() if not NUMBERED.fullmatch(name)}
     return {name: in_object_frame(pose, name, frame) for name, pose in poses.items()}
 
 

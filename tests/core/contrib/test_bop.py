@@ -150,6 +150,7 @@ def test_an_object_that_is_there_twice_and_one_that_nobody_knows_are_left_out(fo
     assert found.observation.names == NAMES[:1]
     assert {name: "several" in why for name, why in found.left_out.items()} == {NAMES[1]: True, "object 30": False}
     assert [note for note in found.notes if "Image 9" in note and NAMES[1] in note]
+    assert [note for note in found.notes if "Image 9" in note and "object 30" in note]
     refused(InvalidInput, f"object {NAMES[1]}", read_bop_scene, folder, LINEAR, NAMES)
     assert read_bop_scene(folder, BopChoice((3, 6), "linear"), NAMES).observation.names == NAMES
 
