@@ -63,6 +63,21 @@ def is_photo(kind: str) -> bool:
     return kind.startswith("image/") or kind == "application/octet-stream"
 
 
+def refuse_form(request: Request, kinds: str) -> None:
+    """Refuse a form: a file is the body itself here.
+
+    Args:
+        request: that brings a file.
+        kinds: of media that are taken, as a header says them.
+
+    Raises:
+        HTTPException: if the body is a form, as `curl -F` and, without a header, `curl --data-binary` send it.
+    """
+    if (kind := kind_of(request)) in ("multipart/form-data", "application/x-www-form-urlencoded"):
+        how = f"send the file itself as the body, with the header Content-Type: {kinds}"
+        raise HTTPException(415, f"The body is a form ({kind}), which is not read here; {how}.")
+
+
 async def whole_body(request: Request, max_bytes: int) -> bytes:
     """All of it.
 

@@ -10,7 +10,18 @@ from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Res
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel, Field
 
-from app.api.bodies import BINARY, FORGOTTEN, JSON, SMALL_BODY_BYTES, Forget, OpenFile, kind_of, parsed, whole_body
+from app.api.bodies import (
+    BINARY,
+    FORGOTTEN,
+    JSON,
+    SMALL_BODY_BYTES,
+    Forget,
+    OpenFile,
+    kind_of,
+    parsed,
+    refuse_form,
+    whole_body,
+)
 from app.api.dependencies import ServicesDep, urgent
 from app.api.events import SEEN, LastEventId, StreamDep, followed, unended
 from app.api.jobs import ProgressOut, progress_of
@@ -189,6 +200,7 @@ async def create(
     The zip holds observation.json and the PNGs that it names, in the format of `osf estimate`; for the modes "next" and
     "goal" also prior.json, a state.json or scene.json of how the objects lay, unless `prior` names an estimate.
     """
+    refuse_form(request, _ZIP)
     kind = kind_of(request)
     if kind == _ZIP:
         job = await services.estimates.of_upload(Asked(mode, seed, prior, method), request.stream(), file_name)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from app.api.bodies import PNG, OpenFile, upload
+from app.api.bodies import PNG, OpenFile, refuse_form, upload
 from app.api.dependencies import Services, ServicesDep
 from app.api.models import FileName, Input
 from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
@@ -83,7 +83,7 @@ def list_all(services: ServicesDep) -> FieldList:
     return FieldList(fields=[_out(services, info) for info in services.fields.all()])
 
 
-@router.post("/sets", status_code=201, responses=problems(409, 507), openapi_extra=upload("application/zip"))
+@router.post("/sets", status_code=201, responses=problems(409, 415, 507), openapi_extra=upload("application/zip"))
 async def upload_set(
     services: ServicesDep,
     request: Request,
@@ -91,6 +91,7 @@ async def upload_set(
     file_name: Annotated[FileName, Query(description="What the zip is called, for people.")] = "set.zip",
 ) -> SetOut:
     """Upload a zipped image set in the OSF format: train/anno.json, test/anno.json and RGBA PNGs beside them."""
+    refuse_form(request, "application/zip")
     record = await services.runner.sets.receive(request.stream(), file_name)
     response.headers["Location"] = f"{UPLOAD_PATH}/{record.id}"
     return SetOut.of(record)

@@ -19,6 +19,7 @@ from app.api.bodies import (
     is_photo,
     kind_of,
     parsed,
+    refuse_form,
     upload,
     whole_body,
 )
@@ -218,6 +219,7 @@ async def create(
     A photo may be of any size and usual format. It shows the table without the pusher; its middle counts as what the
     scenes' goal camera sees, unless `camera` says otherwise or it is cropped later.
     """
+    refuse_form(request, "image/jpeg, or of another picture")
     kind = kind_of(request)
     if is_photo(kind):
         data = await whole_body(request, services.settings.max_photo_bytes)

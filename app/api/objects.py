@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from app.api.bodies import PNG, upload
+from app.api.bodies import PNG, refuse_form, upload
 from app.api.dependencies import Services, ServicesDep, slow
 from app.api.jobs import JobOut
 from app.api.models import FileName, Label, Vector3
@@ -68,7 +68,7 @@ def list_all(services: ServicesDep) -> ObjectList:
     return ObjectList(objects=listed, damaged=damaged)
 
 
-@router.post("", status_code=202, responses=problems(409, 429, 507), openapi_extra=_MESH_BODY)
+@router.post("", status_code=202, responses=problems(409, 415, 429, 507), openapi_extra=_MESH_BODY)
 async def add(
     services: ServicesDep,
     request: Request,
@@ -85,6 +85,7 @@ async def add(
     file_name: Annotated[FileName, Query(description="What the file is called, for people.")] = "mesh",
 ) -> JobOut:
     """Add an object from a GLB, or from a zip of an OBJ with its MTL and texture; answers the job that makes it."""
+    refuse_form(request, "model/gltf-binary or application/zip")
     new = NewObject(name, mass_kg, label, scale, licence)
     job = await services.own_objects.receive(new, request.stream(), file_name)
     response.headers["Location"] = f"/api/jobs/{job.id}"

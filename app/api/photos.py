@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Res
 from pydantic import BaseModel, Field, FiniteFloat
 from starlette.concurrency import run_in_threadpool
 
-from app.api.bodies import JPEG, PNG, BoundedRoute, OpenFile, is_photo, kind_of, upload, whole_body
+from app.api.bodies import JPEG, PNG, BoundedRoute, OpenFile, is_photo, kind_of, refuse_form, upload, whole_body
 from app.api.dependencies import Services, ServicesDep, slow
 from app.api.goals import GoalOut
 from app.api.jobs import JobOut
@@ -27,7 +27,8 @@ from app.processes.messages.photo_messages import CameraSource, Mark, Points, St
 from app.storage.records import MarkedObject, TablePhoto
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.photo.board import Board, board_pdf
-from osfcore.photo.calibration import MOST_PHOTOS, CalibrationJson, board_place, calibration_to_json, known_camera
+from osfcore.photo.calibration import MOST_PHOTOS, CalibrationJson, board_place, calibration_to_json
+from osfcore.photo.camera_files import known_camera
 from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, TableSource
 
 
@@ -299,6 +300,7 @@ async def _photo_body(request: Request, max_bytes: int) -> bytes:
     Raises:
         HTTPException: if it is none, or the upload broke off.
     """
+    refuse_form(request, "image/jpeg, or of another picture")
     if not is_photo(kind_of(request)):
         raise HTTPException(415, "Send a photo, such as a JPEG or PNG file.")
     return await whole_body(request, max_bytes)

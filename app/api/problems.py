@@ -90,7 +90,7 @@ _WORDS = {  # title of each problem, and when routes answer it
     405: ("Method not allowed", "The path does not offer this method."),
     409: ("Conflict", "It does not fit the present state."),
     413: ("Request too large", "The request is too large."),
-    415: ("Unsupported media type", "The body is neither JSON nor a zip."),
+    415: ("Unsupported media type", "The body is of no kind that is read here."),
     421: ("Misdirected request", "The service is not known under this host name."),
     422: ("Invalid input", "The input is not valid; the detail says what is allowed."),
     429: ("Too many requests", "Too many jobs wait already."),

@@ -153,7 +153,7 @@ Export = choice_of(scene=ExportScene, field=ExportField, splats=ExportSplats, bo
 
 @dataclass(frozen=True)
 class Import(DataCommand):
-    """A scene of a BOP data set with YCB-V's objects as an observation folder, for 'osf estimate'."""
+    """A scene in BOP's layout as an observation folder, for 'osf estimate'."""
 
     kind: tyro.conf.Positional[Literal["bop"]]
     """What is imported."""
@@ -170,7 +170,7 @@ class Import(DataCommand):
     encoding: Literal["srgb", "linear"] = "srgb"
     """What values of the pictures mean: sRGB, as cameras write; linear radiance, as in renderings from here."""
     models: Path | None = None
-    """Folder with models_info.json, where the models are not those of BOP's YCB-V, which are centred."""
+    """Folder with models_info.json; by default that of the data set, or BOP's YCB-V if it has none."""
 
     def run(self) -> dict[str, Any]:
         """Import; the result lists images, objects, and objects left out."""
@@ -191,11 +191,11 @@ class Import(DataCommand):
             write_json(partial / POSES_FILE, poses)
             write_observation(partial, scene.observation)
         images = [camera.name for camera in scene.observation.cameras]
-        names, left_out = list(scene.observation.names), list(scene.left_out)
+        names = list(scene.observation.names)
         self.say(f"Wrote {self.out}: images {', '.join(images)} of {', '.join(names)}.")
-        if self.names is None and left_out:
-            self.say(f"Left out, as there are no fields of them: {', '.join(left_out)}.")
-        return {"out": str(self.out), "images": [int(i) for i in images], "objects": names, "left_out": left_out}
+        self.say(*scene.notes, *(f"Left out: {name}, {why}." for name, why in scene.left_out.items()))
+        result = {"out": str(self.out), "images": [int(i) for i in images], "objects": names}
+        return {**result, "left_out": list(scene.left_out), "notes": list(scene.notes)}
 
     def _prior(self, name: str) -> Any:  # noqa: ANN401  TablePrior, which the start of the command line must not load
         from osfcore.estimation.objective import resting_orientations
@@ -233,5 +233,5 @@ class Check(Command):
             raise
         if self.overlay is not None:
             draw_overlay(self.path, self.overlay)
-        self.say(f"{self.path} is a good {report.kind}: {report.summary}.")
+        self.say(f"{self.path} is a good {report.kind}: {report.summary}.", *report.facts.get("notes", ()))
         return {"path": str(self.path), "kind": report.kind, **report.facts}

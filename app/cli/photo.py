@@ -17,6 +17,7 @@ from osfcore.io.files import write_atomically, write_json, writing
 from osfcore.io.json_codec import encode
 from osfcore.photo import calibration
 from osfcore.photo.board import Board, board_pdf
+from osfcore.photo.camera_files import read_camera
 from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
 from osfcore.photo.segmentation import Box, propose_mask
 from osfcore.random_streams import Stream, stream_rng
@@ -99,19 +100,19 @@ class PhotoEstimate(DataCommand):
     masks: tuple[Path, ...] = ()
     """Folder with a mask of each object, NAME.png or mask_NAME.png or BOP's mask_visib; one for each photo."""
     poses: Path | None = None
-    """Poses in the first photo to begin with: BOP's .csv or scene_gt.json, PoseCNN's .mat, or .json."""
+    """Poses in the first photo to begin with: of BOP, PoseCNN, FoundationPose, DOPE or happypose, or .json."""
     image_id: tuple[int, ...] = ()
     """Number of each photo in files of BOP."""
     scene_id: int | None = None
     """Number of the scene in a .csv of BOP."""
     pose_source: str | None = None
     """Whose poses in a photo.json; which variable of a .mat, such as poses_icp."""
-    pose_frame: Literal["bop", "ycb_video", "google_16k"] | None = None
-    """Origin of objects: box's centre, YCB-Video's models, or YCB's meshes; by default what such files usually have."""
+    pose_frame: Literal["bop", "ycb_video", "google_16k", "dope"] | None = None
+    """Frame of objects: box's centre, YCB-Video's models, YCB's meshes, DOPE's; by default what such files have."""
     focal: float | None = None
     """Focal length in pixels; by default that of the board or the camera."""
     camera: Path | None = None
-    """What 'osf photo calibrate' has written about the camera that took the photos."""
+    """The camera that took the photos, from 'osf photo calibrate', ROS, OpenCV, Kalibr or RealSense, or K as .txt."""
     images: Path | None = None
     """Folder for a picture of each object: photo, outlines of mask and object, the object as found."""
     seed: int = 0
@@ -149,11 +150,11 @@ class PhotoEstimate(DataCommand):
         Raises:
             OsfError: with a sentence that says what is wrong.
         """
-        from osfcore.contrib.bop import PoseChoice, read_poses
+        from osfcore.contrib.pose_files import PoseChoice, read_poses
         from osfcore.photo.summary import locate, locate_calibrated
 
         self._check_counts()
-        camera = None if self.camera is None else calibration.read_camera(self.camera)
+        camera = None if self.camera is None else read_camera(self.camera)
         raws = [read_photograph(path) for path in self.photo]
         boxes: list[dict[str, Box]] = [{} for _ in raws]
         for text in self.boxes:
@@ -161,10 +162,10 @@ class PhotoEstimate(DataCommand):
             if name not in known:
                 raise UnknownName("object", name, known)
             boxes[number][name] = box
-        image = self.image_id[0] if self.image_id else None
-        choice = PoseChoice(image, self.scene_id, self.pose_source, self.pose_frame)
-        poses = {} if self.poses is None else read_poses(self.poses, choice)
         masks = [self._masks(known, raw, boxes[number], number) for number, raw in enumerate(raws)]
+        image, marked = self.image_id[0] if self.image_id else None, tuple({name for its in masks for name in its})
+        choice = PoseChoice(image, self.scene_id, self.pose_source, self.pose_frame, marked)
+        poses = {} if self.poses is None else read_poses(self.poses, choice)
         photos, notes, focal_known = [], [], True
         for path, raw, its in zip(self.photo, raws, masks, strict=True):
             found = locate(raw, self.focal) if camera is None else locate_calibrated(raw, camera)
@@ -182,7 +183,7 @@ class PhotoEstimate(DataCommand):
             if unused:
                 notes.append(f"Poses of {unused} were not used: nothing says which pixels show them.")
             if missing:
-                notes.append(f"{missing} had no pose to begin with; all orientations were tried.")
+                notes.append(f"{missing} had no pose to begin with, or several; all orientations were tried.")
         return tuple(photos), starts, tuple(notes), focal_known
 
     def _check_counts(self) -> None:

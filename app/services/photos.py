@@ -52,7 +52,8 @@ from osfcore.geometry.states import MAX_OBJECTS, SceneState
 from osfcore.io.files import read_json
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import decode
-from osfcore.photo.calibration import Calibration, KnownCamera, Sighting
+from osfcore.photo.calibration import Calibration, Sighting
+from osfcore.photo.camera_files import KnownCamera
 from osfcore.photo.found_scene import FoundScene
 from osfcore.photo.table_layout import TableLayout, layout_of
 

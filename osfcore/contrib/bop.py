@@ -1,126 +1,77 @@
-"""Data sets in BOP's layout, and masks and poses of other programs."""
+"""Data sets in BOP's layout: their objects, annotations, results, masks, images and scenes."""
 
 from __future__ import annotations
 
 import csv
 import io
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field, FiniteFloat
-from scipy.io import loadmat
 
 from osfcore.errors import CorruptFile, InvalidInput, OsfError, UnknownName, check_ranges, shown
 from osfcore.estimation.camera_response import Encoding, linear_from_encoded
 from osfcore.geometry.cameras import MAX_IMAGE_SIDE, Camera
-from osfcore.geometry.poses import Pose, quaternion_from_matrix, quaternion_to_matrix, unit_quaternion
+from osfcore.geometry.poses import Pose, quaternion_from_matrix, quaternion_to_matrix
 from osfcore.geometry.states import EstimatedState, Observation
 from osfcore.io.files import read_json
-from osfcore.io.json_codec import Entry, Text, Vector3, Vector4, decode
+from osfcore.io.json_codec import Entry, Text, Vector3, decode
 from osfcore.io.observation_file import MAX_CAMERAS
+from osfcore.photo.lens import HALF_PIXEL
 from osfcore.photo.pose_loss import TablePrior
 from osfcore.photo.poses import table_from_objects
 from osfcore.photo.read_photograph import content_of, read_photograph
 
-# The numbers of YCB-Video's objects, and the frames in which other programs give poses of YCB objects.
+# The objects of a data set: names, sizes, and where the origin of each model lies.
 #
-# Three frames of one object are in use; they have the same axes, and differ in where the origin lies:
-#
-# - "bop": the centre of the mesh's bounding box, as in BOP's YCB-V, and here.
-# - "ycb_video": that of the models that came with YCB-Video (Xiang et al. 2018), of PoseCNN and its descendants: up
-#   to 3 cm away. BOP's notes on its YCB-V list the shifts.
-# - "google_16k": that of the meshes as YCB publishes them, in which the origin lies beside most objects.
-#
-# The bounding boxes of BOP's models and of the google_16k meshes agree along each axis within 0.3 mm, so that their
-# axes are the same; but the wood block's is 13 mm wider in BOP, as if turned by about 9 degrees about z. Its poses
-# are read as they are, and right as starts only.
-
-
-ModelFrame = Literal["bop", "ycb_video", "google_16k"]
-
-_Shift = tuple[float, float, float]
-# Name, from YCB-Video's origin to the box's centre, and from google_16k's (None where that was not measured) [mm]
-_ROWS: tuple[tuple[str, _Shift, _Shift | None], ...] = (
-    ("002_master_chef_can", (-1.3360, 0.5000, -3.5105), (-17.05, -9.76, 69.90)),
-    ("003_cracker_box", (-0.5575, -1.7005, -4.8050), (-12.88, -14.14, 103.48)),
-    ("004_sugar_box", (0.9520, -1.4670, -4.3645), (-7.47, -16.71, 88.04)),
-    ("005_tomato_soup_can", (0.0240, 1.5270, -8.4035), (-9.17, 84.02, 51.01)),
-    ("006_mustard_bottle", (-1.2995, -2.4870, 11.8290), (-15.34, -23.50, 92.50)),
-    ("007_tuna_fish_can", (0.1565, -0.1150, -4.2625), (-26.05, -22.13, 13.55)),
-    ("008_pudding_box", (-1.1645, 4.2015, -3.1190), (0.50, 19.12, 18.95)),
-    ("009_gelatin_box", (-1.4460, 0.5915, -3.6085), (-22.77, -8.24, 14.49)),
-    ("010_potted_meat_can", (-2.4195, -0.3075, -8.0715), (-32.78, -26.55, 38.58)),
-    ("011_banana", (18.6730, -12.1915, 1.4635), (11.48, -7.34, 17.96)),
-    ("019_pitcher_base", (-5.3370, -5.8855, -25.6115), (-5.83, 40.05, 118.37)),
-    ("021_bleach_cleanser", (-4.9290, 2.4800, 13.2920), (-21.66, 11.71, 124.84)),
-    ("024_bowl", (0.2270, -0.7950, 2.9675), (-14.84, -43.69, 26.97)),
-    ("025_mug", (8.4675, 0.6995, 1.6145), (-8.86, 17.34, 40.12)),
-    ("035_power_drill", (-9.0710, -20.9360, 2.1190), (-45.96, 10.59, 25.47)),
-    ("036_wood_block", (-1.4265, 2.5305, -17.1890), (23.71, -10.91, 102.94)),
-    ("037_scissors", (-7.0535, 28.1320, -0.0420), None),
-    ("040_large_marker", (-0.0460, 2.1040, -0.3500), None),
-    ("051_large_clamp", (-10.5180, 1.9640, 0.4745), None),
-    ("052_extra_large_clamp", (0.3950, 10.4130, -0.1620), None),
-    ("061_foam_brick", (0.0805, -0.0805, 8.2435), (-18.26, 17.20, 25.25)),
-)
-NAMES: tuple[str, ...] = tuple(name for name, _, _ in _ROWS)
-_SHIFTS_MM: dict[str, dict[str, _Shift]] = {
-    "ycb_video": {name: shift for name, shift, _ in _ROWS},
-    "google_16k": {name: shift for name, _, shift in _ROWS if shift is not None}
-    | {
-        "013_apple": (0.86, -3.78, 35.55),
-        "016_pear": (-33.32, 17.99, 32.65),
-        "022_windex_bottle": (18.29, 11.93, 134.25),
-    },
-}
-
-
-def name_of(number: int) -> str:
-    """Return the object with a number, from 1 (002_master_chef_can) to 21 (061_foam_brick), of BOP's YCB-V and PoseCNN.
-
-    Raises:
-        InvalidInput: if there is none.
-    """
-    if not 1 <= number <= len(NAMES):
-        raise InvalidInput("number of the object", number, f"1 to {len(NAMES)}, as in YCB-Video")
-    return NAMES[number - 1]
-
-
-def in_object_frame(pose: Pose, name: str, frame: ModelFrame) -> Pose:
-    """Return `T_camera_object`, in the frame of the box's centre, of a pose in one of the other frames.
-
-    Args:
-        pose: from the model's frame to the camera's.
-        name: of the object.
-        frame: of the model.
-
-    Raises:
-        UnknownName: if it is not known where the box's centre lies in that frame.
-    """
-    if frame == "bop":  # whatever the object
-        return pose
-    shifts = _SHIFTS_MM[frame]
-    if name not in shifts:
-        raise UnknownName(f"object of known origin in the frame {frame}", name, shifts)
-    return Pose(pose.apply(1e-3 * np.array(shifts[name])), pose.quaternion)
-
-
-# models_info.json of BOP: where the origin of each model lies.
+# A data set numbers its objects. Where its models_info.json gives an object a "name", it is called so; else the numbers
+# count as those of BOP's YCB-V, 1 (002_master_chef_can) to 21 (061_foam_brick), if the sizes are YCB-V's, too.
 #
 # Objects here have their origin at the centre of their bounding box. A model of BOP spans min_x to min_x + size_x,
 # and so on [mm], so that the centre lies at min + size / 2 in its frame. In BOP's own YCB-V that is zero.
 
 
 MODELS_INFO = "models_info.json"
+_Size = tuple[float, float, float]
+_YCBV: tuple[tuple[str, _Size | None], ...] = (  # the box of each object [mm]; None where it was not measured
+    ("002_master_chef_can", (102.5, 102.4, 140.2)),
+    ("003_cracker_box", (71.8, 164.0, 213.4)),
+    ("004_sugar_box", (49.5, 94.2, 176.0)),
+    ("005_tomato_soup_can", (67.9, 67.7, 101.9)),
+    ("006_mustard_bottle", (97.2, 66.6, 191.3)),
+    ("007_tuna_fish_can", (85.6, 85.5, 33.5)),
+    ("008_pudding_box", (137.9, 128.8, 38.9)),
+    ("009_gelatin_box", (89.4, 101.1, 30.1)),
+    ("010_potted_meat_can", (102.1, 60.1, 83.5)),
+    ("011_banana", (108.9, 178.4, 36.7)),
+    ("019_pitcher_base", (149.1, 144.8, 242.4)),
+    ("021_bleach_cleanser", (102.4, 67.7, 250.6)),
+    ("024_bowl", (161.5, 161.2, 55.0)),
+    ("025_mug", (117.0, 93.1, 81.3)),
+    ("035_power_drill", (184.2, 187.5, 57.3)),
+    ("036_wood_block", (90.6, 89.9, 206.0)),
+    ("037_scissors", None),
+    ("040_large_marker", None),
+    ("051_large_clamp", None),
+    ("052_extra_large_clamp", None),
+    ("061_foam_brick", (52.6, 77.9, 51.2)),
+)
+NAMES: tuple[str, ...] = tuple(name for name, _ in _YCBV)
+_MOST_OTHER, _MOST_OTHER_MM = 0.2, 5.0  # by which a side may differ; the wood block's do by 13 mm
+NUMBERED = re.compile(r"object -?\d+")  # the name of an object of which only the number is known
+_WHOSE = 'obj_id seems to count another data set\'s objects; give each its "name" in models_info.json'
 
 
 class _ModelJson(Entry):
+    name: Text | None = None
     min_x: FiniteFloat
     min_y: FiniteFloat
     min_z: FiniteFloat
@@ -129,8 +80,32 @@ class _ModelJson(Entry):
     size_z: FiniteFloat = Field(gt=0)
 
 
-def read_centres(models: Path | None) -> Mapping[str, Float[np.ndarray, "3"]]:
-    """Read where the box's centre lies in each model's frame, by name of the object [m].
+@dataclass(frozen=True, eq=False, slots=True)
+class BopObject:
+    """An object of a data set.
+
+    Attributes:
+        name: of the object; "object 22" where nothing says more than its number.
+        centre: of its box, in the frame of its model [m].
+        size: of its box [m]; None where it is not known.
+    """
+
+    name: str
+    centre: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    size: Float[np.ndarray, "3"] | None = None
+
+
+def models_beside(scene: Path) -> Path | None:
+    """Return the folder of the models_info.json that belongs to the folder of a scene; None if there is none.
+
+    A data set holds models, or models_cad and so on, beside the scenes or beside the folder of the split.
+    """
+    infos = [info for place in scene.absolute().parents[:2] for info in sorted(place.glob(f"models*/{MODELS_INFO}"))]
+    return infos[0].parent if infos else None
+
+
+def read_objects(models: Path | None) -> Mapping[int, BopObject]:
+    """Read the objects of a data set, by number.
 
     Args:
         models: folder with models_info.json; None for BOP's YCB-V, whose models are centred.
@@ -139,27 +114,45 @@ def read_centres(models: Path | None) -> Mapping[str, Float[np.ndarray, "3"]]:
         CorruptFile: if the file is missing or broken.
     """
     if models is None:
-        return dict.fromkeys(NAMES, np.zeros(3))
+        return {
+            number: BopObject(name, size=None if size is None else 1e-3 * np.array(size))
+            for number, (name, size) in enumerate(_YCBV, 1)
+        }
     entries = read_json(models / MODELS_INFO, lambda data: decode(dict[str, _ModelJson], data, MODELS_INFO))
-    known = {str(number): name for number, name in enumerate(NAMES, 1)}
-    return {
-        known[number]: 1e-3 * np.array([e.min_x + e.size_x / 2, e.min_y + e.size_y / 2, e.min_z + e.size_z / 2])
-        for number, e in entries.items()
-        if number in known
-    }
+    found = {}
+    for number, entry in entries.items():
+        if number.isdecimal():
+            size = 1e-3 * np.array([entry.size_x, entry.size_y, entry.size_z])
+            centre = 1e-3 * np.array([entry.min_x, entry.min_y, entry.min_z]) + size / 2
+            usual = NAMES[int(number) - 1] if 1 <= int(number) <= len(NAMES) else f"object {number}"
+            found[int(number)] = BopObject(entry.name or usual, centre, size)
+    return found
 
 
-# Poses that another program found in a photograph, in the camera's frame.
+def object_of(objects: Mapping[int, BopObject], number: int) -> BopObject:
+    """Return the object with a number; one of which only that is known if the data set says nothing of it.
+
+    Raises:
+        InvalidInput: with both sizes, if its model has another size than the object of YCB-V that it would be.
+    """
+    found = objects.get(number, BopObject(f"object {number}"))
+    ours = dict(_YCBV).get(found.name)
+    if ours is not None and found.size is not None:
+        size = 1e3 * found.size
+        if np.any(np.abs(size - ours) > _MOST_OTHER_MM + _MOST_OTHER * np.array(ours)):
+            allowed = f"{_sides(ours)}, as {found.name} is; {_WHOSE}"
+            raise InvalidInput(f"size of object {number} in {MODELS_INFO} [mm]", _sides(size), allowed)
+    return found
+
+
+def _sides(size: Sequence[float] | np.ndarray) -> str:
+    return " x ".join(f"{side:.3g}" for side in size)
+
+
+# Annotations and results: poses of objects in images, numbered.
 #
-# | file          | what it is                                                                  | unit | frame     |
-# | .csv          | results of BOP: scene_id,im_id,obj_id,score,R,t,time                        | mm   | bop       |
-# | scene_gt.json | annotations of BOP: cam_R_m2c, cam_t_m2c, obj_id by image                   | mm   | bop       |
-# | .mat          | results of PoseCNN: rois (column 1 is the class), poses (w, x, y, z, then   | m    | ycb_video |
-# |               | the position)                                                               |      |           |
-# | .json         | {"025_mug": {"position": [3], "quaternion": [w, x, y, z]}}, or that by      | m    | bop       |
-# |               | source, as in photo.json                                                    |      |           |
-#
-# Objects of BOP and PoseCNN have YCB-Video's numbers.
+# scene_gt.json  {"IMAGE": [{"obj_id", "cam_R_m2c", "cam_t_m2c"}]}, mm
+# .csv           scene_id,im_id,obj_id,score,R,t,time, mm
 
 
 MAX_BYTES = 100_000_000
@@ -167,114 +160,39 @@ HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 SCENE_CAMERA, SCENE_GT = "scene_camera.json", "scene_gt.json"
 _MOST_SKEW = 0.02  # of R R^T from the identity
 _NEAR_M, _FAR_M = 0.02, 20.0  # where objects can be before a camera, and a table's frame
-_KINDS = "a .csv of BOP, a scene_gt.json, a .mat of PoseCNN, or a .json with a position and a quaternion of each object"
-
-
-@dataclass(frozen=True, slots=True)
-class PoseChoice:
-    """Which of the poses in a file are meant; what is None may be left open only where it is the only one.
-
-    Attributes:
-        image: number of the image.
-        scene: number of the scene.
-        source: in a photo.json, whose poses; in a .mat, the variable that holds them ("poses" by default).
-        frame: of the objects; that of the file's kind if None.
-    """
-
-    image: int | None = None
-    scene: int | None = None
-    source: str | None = None
-    frame: ModelFrame | None = None
-
-
-class _PoseJson(Entry):
-    position: Vector3
-    quaternion: Vector4
 
 
 class _BopJson(Entry):
     rotation: list[float] = Field(alias="cam_R_m2c")
-    position: Vector3 = Field(alias="cam_t_m2c")
+    position: list[float] = Field(alias="cam_t_m2c")
     obj_id: int
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Row:
-    """One pose of a table."""
+class BopRow:
+    """One pose of a table.
+
+    Attributes:
+        scene: its number; 0 in a scene_gt.json.
+        image: number of the image.
+        object: that it is of.
+        score: the larger, the surer.
+        pose: `T_camera_object` to the centre of its box; None for one that lies behind the camera.
+    """
 
     scene: int
     image: int
-    name: str
+    object: BopObject
     score: float
-    pose: Pose
+    pose: Pose | None
 
 
-def read_poses(path: Path, choice: PoseChoice | None = None) -> dict[str, Pose]:
-    """Read `T_camera_object` by name, to the centre of the object's box; of several poses the one with the best score.
-
-    Args:
-        path: of the file, in one of the forms above.
-        choice: which of its poses.
-
-    Raises:
-        CorruptFile: if it is none of these, or a pose in it makes no sense.
-        InvalidInput: if it holds several images, scenes or sources and the choice leaves it open, or lacks the chosen.
-        UnknownName: if an object's origin is not known in the frame.
-    """
-    choice, suffix = choice or PoseChoice(), path.suffix.lower()
-    frame: ModelFrame = "bop"
-    if suffix == ".csv":
-        poses = _of_image(_csv_rows(path), choice)
-    elif suffix == ".mat":
-        poses, frame = _of_mat(path, choice.source or "poses"), "ycb_video"
-    elif suffix == ".json":
-        poses = _of_json(path, choice)
-    else:
-        raise CorruptFile(shown(path), f"poses come in {_KINDS}")
-    return {name: in_object_frame(pose, name, choice.frame or frame) for name, pose in poses.items()}
-
-
-def scene_gt_names(path: Path, image: int) -> tuple[str, ...]:
-    """Read the objects of an image from a scene_gt.json, in the order by which BOP numbers its masks.
-
-    Raises:
-        CorruptFile: if it is no scene_gt.json.
-        InvalidInput: if it lacks the image.
-    """
-    return tuple(row.name for row in _image_rows(path, image))
-
-
-def result_images(path: Path) -> dict[tuple[int, int], list[str]]:
-    """Read the objects by scene and image from results of BOP (.csv).
+def result_rows(path: Path) -> list[BopRow]:
+    """Read results of BOP (.csv), of YCB-V's objects.
 
     Raises:
         CorruptFile: if the file is broken.
     """
-    found: dict[tuple[int, int], list[str]] = {}
-    for row in _csv_rows(path):
-        found.setdefault((row.scene, row.image), []).append(row.name)
-    return found
-
-
-def _of_image(rows: list[_Row], choice: PoseChoice) -> dict[str, Pose]:
-    scene = _only("scene of the poses", choice.scene, {row.scene for row in rows})
-    rows = [row for row in rows if row.scene == scene]
-    image = _only("image of the poses", choice.image, {row.image for row in rows})
-    chosen = sorted((row for row in rows if row.image == image), key=lambda row: row.score)
-    return {row.name: row.pose for row in chosen}  # the best comes last
-
-
-def _only(what: str, asked: int | str | None, there: set[int] | set[str]) -> Any:  # noqa: ANN401
-    """Return what is asked for, or the only one there is."""
-    if asked is None and len(there) == 1:
-        return next(iter(there))
-    if asked not in there:
-        some = shown(", ".join(str(one) for one in sorted(there)))
-        raise InvalidInput(what, "missing" if asked is None else asked, f"one of {some or 'none'}")
-    return asked
-
-
-def _csv_rows(path: Path) -> list[_Row]:
     text = content_of(path, shown(path), MAX_BYTES).decode("utf-8-sig", errors="replace").replace("\0", "?")
     try:
         lines = [line for line in csv.reader(io.StringIO(text)) if line]
@@ -284,12 +202,13 @@ def _csv_rows(path: Path) -> list[_Row]:
         lines = lines[1:]
     if not lines:
         raise CorruptFile(shown(path), "it holds no poses")
-    rows = []
+    rows, objects = [], read_objects(None)
     for number, line in enumerate(lines, 1):
         try:
             scene, image, obj = (int(value) for value in line[:3])
             rotation, shift = (np.array(line[k].split(), float) for k in (4, 5))
-            rows.append(_Row(scene, image, name_of(obj), float(line[3]), _bop_pose(rotation, shift)))
+            found = object_of(objects, obj)
+            rows.append(BopRow(scene, image, found, float(line[3]), _pose(rotation, shift, found)))
         except OsfError as error:
             raise CorruptFile(shown(path), f"pose {number}: {str(error).rstrip('.')}") from None
         except (ValueError, IndexError):
@@ -298,71 +217,72 @@ def _csv_rows(path: Path) -> list[_Row]:
     return rows
 
 
-def _gt_rows(data: object) -> list[_Row]:
-    """Return the rows of a scene_gt.json; those of one image in its order."""
-    by_image = decode(dict[str, list[_BopJson]], data, "scene_gt")
-    return [
-        _Row(0, int(image), name_of(entry.obj_id), 0.0, _bop_pose(np.array(entry.rotation), np.array(entry.position)))
-        for image, entries in by_image.items()
-        for entry in entries
-    ]
+def result_images(path: Path) -> dict[tuple[int, int], list[str]]:
+    """Read the objects by scene and image from results of BOP (.csv).
 
-
-def _image_rows(path: Path, image: int) -> list[_Row]:
-    """Read the rows of one image from a scene_gt.json, in its order."""
-    return [row for row in read_json(path, _gt_rows) if row.image == image]
-
-
-def _of_json(path: Path, choice: PoseChoice) -> dict[str, Pose]:
-    def parse(data: object) -> dict[str, Pose] | list[_Row]:
-        if isinstance(data, dict) and data and all(str(key).isdecimal() for key in data):
-            return _gt_rows(data)
-        if isinstance(data, dict) and "poses_camera_object" in data:
-            by_source = decode(dict[Text, dict[Text, _PoseJson]], data["poses_camera_object"], "poses_camera_object")
-            entries: Mapping[str, _PoseJson] = by_source[_only("source of the poses", choice.source, set(by_source))]
-        else:
-            entries = decode(dict[Text, _PoseJson], data, "poses")
-        return {name: _pose(entry.quaternion, entry.position, name) for name, entry in entries.items()}
-
-    found = read_json(path, parse)
-    return _of_image(found, PoseChoice(choice.image)) if isinstance(found, list) else found
-
-
-def _of_mat(path: Path, variable: str) -> dict[str, Pose]:
-    content = content_of(path, shown(path), MAX_BYTES)
-    try:
-        data = loadmat(io.BytesIO(content))
-        classes, poses = np.atleast_2d(data["rois"])[:, 1].astype(int), np.atleast_2d(data[variable]).astype(float)
-        scores = np.atleast_2d(data["rois"])[:, 6:].astype(float)
-    except KeyError as error:
-        raise CorruptFile(shown(path), f"it has no variable {error}, as results of PoseCNN have") from None
-    except Exception:  # readers of MATLAB's files raise whatever they stumble over
-        raise CorruptFile(shown(path), "it is no file of MATLAB with results of PoseCNN") from None
-    if poses.shape != (len(classes), 7):
-        raise CorruptFile(shown(path), f"its {variable} are not 7 numbers for each of its {len(classes)} rois")
-    order = np.argsort(scores[:, 0], kind="stable") if scores.shape[1] else np.arange(len(classes))[::-1]
-    found = {}
-    for k in order:
-        if np.any(poses[k, :4]):  # zeros stand for what was not found
-            try:
-                name = name_of(int(classes[k]))
-                found[name] = _pose(poses[k, :4], poses[k, 4:], name)
-            except OsfError as error:
-                raise CorruptFile(shown(path), str(error).rstrip(".")) from None
+    Raises:
+        CorruptFile: if the file is broken.
+    """
+    found: dict[tuple[int, int], list[str]] = {}
+    for row in result_rows(path):
+        found.setdefault((row.scene, row.image), []).append(row.object.name)
     return found
 
 
-def _bop_pose(rotation: np.ndarray, shift_mm: np.ndarray) -> Pose:
-    """Return the pose of a rotation matrix, row by row, and a position in mm."""
+def annotated_rows(path: Path, image: int | None = None, models: Path | None = None) -> list[BopRow]:
+    """Read a scene_gt.json; rows of one image are in the order by which BOP numbers its masks.
+
+    Args:
+        path: of the file, in the folder of the scene.
+        image: whose rows are wanted; None for all.
+        models: folder with models_info.json; None for that of the data set, or YCB-V if it has none.
+
+    Raises:
+        CorruptFile: if it is no scene_gt.json, or its objects have other sizes than those that their numbers stand for.
+    """
+    objects = read_objects(models or models_beside(path.parent))
+
+    def parse(data: object) -> list[BopRow]:
+        rows = []
+        for number, entries in decode(dict[str, list[_BopJson]], data, "scene_gt").items():
+            if number.isdecimal() and image in (None, int(number)):
+                for entry in entries:
+                    found = object_of(objects, entry.obj_id)
+                    pose = _pose(np.array(entry.rotation), np.array(entry.position), found)
+                    rows.append(BopRow(0, int(number), found, 0.0, pose))
+        return rows
+
+    return read_json(path, parse)
+
+
+def _pose(rotation: np.ndarray, shift_mm: np.ndarray, of: BopObject) -> Pose | None:
+    """Return the pose of a rotation matrix, row by row, and a position in mm; None if that is behind the camera."""
     if rotation.shape != (9,) or shift_mm.shape != (3,):
         given = f"{rotation.size} and {shift_mm.size} numbers"
         raise InvalidInput("pose", given, "9 for the rotation and 3 for the position")
-    quaternion = _nearest_rotation(rotation.reshape(3, 3), "rotation")
-    return Pose(_before_camera(1e-3 * shift_mm, "mm"), quaternion)
+    quaternion = nearest_rotation(rotation.reshape(3, 3), "rotation")
+    if shift_mm[2] <= 0:  # BlenderProc annotates what is out of view, too
+        return None
+    pose = Pose(before_camera(1e-3 * shift_mm, "mm"), quaternion)
+    return Pose(pose.apply(of.centre), quaternion)
 
 
-def _nearest_rotation(matrix: Float[np.ndarray, "3 3"], what: str) -> Float[np.ndarray, "4"]:
-    """Return the unit quaternion of the rotation next to a matrix, which must be one but for rounding."""
+def only(what: str, asked: int | str | None, there: set[int] | set[str]) -> Any:  # noqa: ANN401
+    """Return what is asked for, or the only one there is."""
+    if asked is None and len(there) == 1:
+        return next(iter(there))
+    if asked not in there:
+        some = shown(", ".join(str(one) for one in sorted(there)))
+        raise InvalidInput(what, "missing" if asked is None else asked, f"one of {some or 'none'}")
+    return asked
+
+
+def nearest_rotation(matrix: Float[np.ndarray, "3 3"], what: str) -> Float[np.ndarray, "4"]:
+    """Return the unit quaternion of the rotation next to a matrix, which must be one but for rounding.
+
+    Raises:
+        InvalidInput: if it is none.
+    """
     bounded = np.all(np.abs(matrix) < 1 + _MOST_SKEW)  # false for NaN
     if not bounded or np.abs(matrix @ matrix.T - np.eye(3)).max() > _MOST_SKEW or np.linalg.det(matrix) < 0:
         raise InvalidInput(what, matrix.round(3).tolist(), "a rotation matrix, row by row")
@@ -370,12 +290,12 @@ def _nearest_rotation(matrix: Float[np.ndarray, "3 3"], what: str) -> Float[np.n
     return quaternion_from_matrix(left @ right)
 
 
-def _pose(quaternion: Any, position: Any, name: str) -> Pose:  # noqa: ANN401
-    quaternion = unit_quaternion(np.array(quaternion, float), f"quaternion of {shown(name)}")
-    return Pose(_before_camera(np.array(position, float), "m"), quaternion)
+def before_camera(position: Float[np.ndarray, "3"], unit: str) -> Float[np.ndarray, "3"]:
+    """Return a position before a camera [m] after checking it; `unit` is that of the file.
 
-
-def _before_camera(position: np.ndarray, unit: str) -> np.ndarray:
+    Raises:
+        InvalidInput: if it is behind the camera, or out of reach.
+    """
     if not _NEAR_M <= position[2] <= _FAR_M or not np.all(np.abs(position) <= _FAR_M):
         allowed = f"{_NEAR_M:g} to {_FAR_M:g} m before the camera; it is read as {unit}, z forward"
         raise InvalidInput("position [m]", position.round(6).tolist(), allowed)
@@ -417,24 +337,24 @@ def bop_results(
 
     Raises:
         InvalidInput: if a camera's name is no number.
-        UnknownName: if an object is not one of YCB-V, or models_info.json lacks it.
+        UnknownName: if an object is not one of the data set.
         CorruptFile: if models_info.json is missing or broken.
     """
     check_ranges(("number of the scene", scene, 0, _MOST_SCENE), ("time [s]", seconds, UNKNOWN_TIME, np.inf))
-    centres = read_centres(models)
+    objects = {found.name: (number, found.centre) for number, found in read_objects(models).items()}
     lines = [HEADER]
     for camera in cameras:
         if not camera.name.isdecimal():
             raise InvalidInput("name of a camera", camera.name, "the number of its image in BOP's scene")
         T_camera_world = camera.T_world_camera.inverse()
         for name, std in zip(estimate.state.names, estimate.position_std, strict=True):
-            if name not in centres:
-                raise UnknownName("object of BOP's YCB-V", name, centres)
-            pose = T_camera_world @ estimate.state.pose(name)
-            parts = quaternion_to_matrix(pose.quaternion).ravel(), 1e3 * pose.apply(-centres[name])
+            if name not in objects:
+                raise UnknownName("object of the data set", name, objects)
+            (number, centre), pose = objects[name], T_camera_world @ estimate.state.pose(name)
+            parts = quaternion_to_matrix(pose.quaternion).ravel(), 1e3 * pose.apply(-centre)
             R, t = (" ".join(f"{value:.8f}" for value in part) for part in parts)
             score = f"{1 / (1 + 1e3 * std):.6g}"
-            lines.append(f"{scene},{int(camera.name)},{NAMES.index(name) + 1},{score},{R},{t},{seconds:g}")
+            lines.append(f"{scene},{int(camera.name)},{number},{score},{R},{t},{seconds:g}")
     return "\n".join(lines) + "\n"
 
 
@@ -466,7 +386,7 @@ def read_masks(
     if not folder.is_dir():
         raise InvalidInput("folder of masks", folder, "a folder that exists")
     files = _bop_files(folder, image)
-    if not files:
+    if files is None:
         named = [(name, folder / f"{start}{name}.png") for name in known for start in ("", "mask_")]
         files = {name: path for name, path in named if path.is_file()}
     masks = {name: _read(path, *sizes) for name, path in files.items() if name in known}
@@ -476,18 +396,22 @@ def read_masks(
     return masks
 
 
-def _bop_files(folder: Path, image: int | None) -> dict[str, Path]:
-    """Return the files that are numbered as BOP does, by object."""
+def _bop_files(folder: Path, image: int | None) -> dict[str, Path] | None:
+    """Return the files that are numbered as BOP does, by object; None if there are none."""
     numbered = [match for path in folder.iterdir() if (match := _BOP_NAME.fullmatch(path.name))]
     if not numbered:
-        return {}
-    shown = _only("image of the masks", image, {int(match[1]) for match in numbered})
+        return None
+    shown = only("image of the masks", image, {int(match[1]) for match in numbered})
     table = next((place / SCENE_GT for place in (folder, folder.parent) if (place / SCENE_GT).is_file()), None)
     if table is None:
         raise InvalidInput(f"{SCENE_GT} of the masks", "missing", "in the folder above them: it names what they show")
-    names = scene_gt_names(table, shown)
-    its = {int(match[2]): folder / match[0] for match in numbered if int(match[1]) == shown}
-    return {name: its[index] for index, name in enumerate(names) if index in its}
+    return _mask_files(folder, shown, [row.object.name for row in annotated_rows(table, shown)])
+
+
+def _mask_files(folder: Path, image: int, names: Sequence[str]) -> dict[str, Path]:
+    """Return the files of an image's masks by object, given these in their order; of none that is there twice."""
+    files = {name: folder / f"{image:06d}_{index:06d}.png" for index, name in enumerate(names)}
+    return {name: path for name, path in files.items() if names.count(name) == 1 and path.is_file()}
 
 
 def _read(path: Path, sent: tuple[int, int], kept: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
@@ -513,11 +437,11 @@ def _read(path: Path, sent: tuple[int, int], kept: tuple[int, int]) -> Bool[np.n
 #   rgb/IMAGE.png or .jpg with six digits
 #   mask_visib/IMAGE_INDEX.png
 #
-# What is assumed: objects have the numbers of YCB-V, and each is there once. BOP counts pixels from the centre of
-# the first one, which is at (0.5, 0.5) here, so that half a pixel is added to its principal points.
+# BOP counts pixels from the centre of the first one, which is at (0.5, 0.5) here, so that half a pixel is added to its
+# principal points.
 
 
-_HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0.0]])
+_MASKS = "mask_visib"
 
 
 class _CameraJson(Entry):
@@ -535,7 +459,7 @@ class _CameraJson(Entry):
         """
         if self.R_w2c is None or self.t_w2c is None:
             return None
-        quaternion = _nearest_rotation(np.array(self.R_w2c).reshape(3, 3), f"cam_R_w2c of image {image}")
+        quaternion = nearest_rotation(np.array(self.R_w2c).reshape(3, 3), f"cam_R_w2c of image {image}")
         t = 1e-3 * np.array(self.t_w2c)
         if np.linalg.norm(t) > _FAR_M:
             raise InvalidInput(f"cam_t_w2c of image {image} [mm]", self.t_w2c, f"below {1e3 * _FAR_M:g} in length")
@@ -549,7 +473,7 @@ class BopChoice:
     Attributes:
         images: their numbers; None for all, spread evenly if there are more than an observation holds.
         encoding: of the pictures.
-        models: folder with models_info.json; None for BOP's YCB-V.
+        models: folder with models_info.json; None for that of the data set, or YCB-V if it has none.
     """
 
     images: tuple[int, ...] | None = None
@@ -566,8 +490,11 @@ class BopImage:
         camera: in its own frame: `T_world_camera` is the identity.
         picture: linear RGB in [0, 1].
         masks: visible pixels, of objects that have some.
-        poses: annotated, `T_camera_object` to the centre of the box.
+        poses: annotated, `T_camera_object` to the centre of the box; of objects that are there once.
         T_camera_world: from BOP's world; None where that is unknown.
+        sizes: of the boxes of these objects [m], where they are known.
+        unmasked: objects with a pose but without a file of their mask.
+        twice: objects that are annotated several times, of which nobody could tell one from the other.
     """
 
     number: int
@@ -576,6 +503,9 @@ class BopImage:
     masks: Mapping[str, Bool[np.ndarray, "h w"]]
     poses: Mapping[str, Pose]
     T_camera_world: Pose | None
+    sizes: Mapping[str, Float[np.ndarray, "3"]]
+    unmasked: tuple[str, ...]
+    twice: tuple[str, ...]
 
 
 def is_bop_scene(path: Path) -> bool:
@@ -591,8 +521,9 @@ def read_images(folder: Path, choice: BopChoice | None = None) -> tuple[BopImage
         choice: which.
 
     Raises:
-        CorruptFile: if a file is missing or broken, or a mask has another size than its picture.
-        InvalidInput: if an image is chosen that is not there, or an object is there several times.
+        CorruptFile: if a file is missing or broken, a mask has another size than its picture, or objects have other
+            sizes than those that their numbers stand for.
+        InvalidInput: if an image is chosen that is not there.
     """
 
     def parse(data: object) -> dict[int, _CameraJson]:
@@ -602,9 +533,8 @@ def read_images(folder: Path, choice: BopChoice | None = None) -> tuple[BopImage
         return {int(number): entry for number, entry in entries.items()}
 
     choice = choice or BopChoice()
-    entries, centres = read_json(folder / SCENE_CAMERA, parse), read_centres(choice.models)
-    numbers = _chosen(choice.images, tuple(entries))
-    return tuple(_image(folder, n, entries[n], _annotated(folder, n, centres), choice.encoding) for n in numbers)
+    entries = read_json(folder / SCENE_CAMERA, parse)
+    return tuple(_image(folder, n, entries[n], choice) for n in _chosen(choice.images, tuple(entries)))
 
 
 def _chosen(asked: tuple[int, ...] | None, there: tuple[int, ...]) -> tuple[int, ...]:
@@ -618,20 +548,12 @@ def _chosen(asked: tuple[int, ...] | None, there: tuple[int, ...]) -> tuple[int,
     return asked
 
 
-def _annotated(folder: Path, image: int, centres: Mapping[str, np.ndarray]) -> dict[str, Pose]:
-    """Read `T_camera_object` of the objects in an image, in the frame of their boxes' centres."""
-    poses: dict[str, Pose] = {}
-    for row in _image_rows(folder / SCENE_GT, image):
-        if row.name in poses:
-            raise InvalidInput(f"objects of image {image}", f"{row.name} several times", "each there once")
-        if row.name not in centres:
-            raise InvalidInput(f"model of {row.name}", "missing", "in models_info.json")
-        poses[row.name] = Pose(row.pose.apply(centres[row.name]), row.pose.quaternion)
-    return poses
-
-
-def _image(folder: Path, number: int, entry: _CameraJson, poses: Mapping[str, Pose], encoding: Encoding) -> BopImage:
+def _image(folder: Path, number: int, entry: _CameraJson, choice: BopChoice) -> BopImage:
     """Read an image with what belongs to it, reduced to the largest size of cameras."""
+    rows, encoding = annotated_rows(folder / SCENE_GT, number, choice.models), choice.encoding
+    names = [row.object.name for row in rows]
+    poses = {row.object.name: row.pose for row in rows if row.pose is not None and names.count(row.object.name) == 1}
+    sizes = {row.object.name: row.object.size for row in rows if row.object.size is not None}
     png, jpg = (folder / "rgb" / f"{number:06d}{suffix}" for suffix in (".png", ".jpg"))
     picture_file = next((path for path in (png, jpg) if path.is_file()), None)
     if picture_file is None:
@@ -640,12 +562,11 @@ def _image(folder: Path, number: int, entry: _CameraJson, poses: Mapping[str, Po
     width, height = raw.sent_size
     scale = min(1.0, MAX_IMAGE_SIDE / max(width, height))
     size = round(width * scale), round(height * scale)
-    K = np.diag([size[0] / width, size[1] / height, 1.0]) @ (np.array(entry.K).reshape(3, 3) + _HALF_PIXEL)
-    masks: Mapping[str, np.ndarray] = {}
+    K = np.diag([size[0] / width, size[1] / height, 1.0]) @ (np.array(entry.K).reshape(3, 3) + HALF_PIXEL)
+    files = _mask_files(folder / _MASKS, number, names)
     try:
         camera, T_camera_world = Camera(str(number), Pose.identity(), K, *size), entry.T_camera_world(number)
-        if poses:
-            masks = read_masks(folder / "mask_visib", poses, (raw.sent_size, size), number)
+        masks = {name: _read(path, raw.sent_size, size) for name, path in files.items() if name in poses}
     except CorruptFile:
         raise
     except OsfError as error:
@@ -653,7 +574,79 @@ def _image(folder: Path, number: int, entry: _CameraJson, poses: Mapping[str, Po
     picture = linear_from_encoded(raw.encoded.astype(np.float32) / np.iinfo(raw.encoded.dtype).max, encoding)
     if raw.encoded.shape[1::-1] != size:
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return BopImage(number, camera, np.clip(picture, 0, 1), masks, poses, T_camera_world)
+    masks, picture = {name: mask for name, mask in masks.items() if mask.any()}, np.clip(picture, 0, 1)
+    unmasked = tuple(name for name in poses if name not in files)
+    twice = tuple(name for name, count in Counter(names).items() if count > 1)
+    return BopImage(number, camera, picture, masks, poses, T_camera_world, sizes, unmasked, twice)
+
+
+# What speaks against a scene as a whole, and what is missing in it.
+
+
+_SHARE = 0.5  # of the objects that must lie where their masks are, and be as large as these
+_LEAST_PIXELS = 20  # of a mask that counts
+_LARGER, _SMALLER = 1.15, 0.55  # most and least of what the box extends to; a ball reaches 0.58 of its own
+
+
+def check_scene(images: Sequence[BopImage]) -> None:
+    """Refuse a scene whose annotations are of other images, or of other objects.
+
+    Most objects' centres must project into the boxes of their visible pixels, grown by the boxes' own sizes to all
+    sides. Most masks must be about as large as the boxes of the objects that their numbers stand for.
+
+    Raises:
+        InvalidInput: naming the first that does not fit.
+    """
+    known = [(image, name) for image in images for name in image.masks]
+    wrong = [(image, name) for image, name in known if not _fits(image, name)]
+    if len(wrong) > _SHARE * len(known):
+        image, name = wrong[0]
+        u, v = image.camera.project(image.poses[name].position)
+        what = f"place of {name} in image {image.number} by cam_K and cam_t_m2c [px]"
+        allowed = "where its mask is; cam_K may be of another image size, or the masks of another image"
+        raise InvalidInput(what, f"({u:.0f}, {v:.0f})", allowed)
+    extents: dict[str, list[tuple[float, float, BopImage]]] = {}
+    for image, name in known:
+        if name in image.sizes and image.masks[name].sum() >= _LEAST_PIXELS:
+            extents.setdefault(name, []).append((*_extents(image, name), image))
+    shares = {name: [seen / expected for seen, expected, _ in its] for name, its in extents.items()}
+    other = [name for name, its in shares.items() if np.median(its) > _LARGER or max(its) < _SMALLER]
+    if len(other) > _SHARE * len(shares):
+        seen, expected, image = max(extents[other[0]], key=lambda each: each[0] / each[1])
+        what = f"extent of the mask of {other[0]} in image {image.number} [px]"
+        box = f"a box of {_sides(1e3 * image.sizes[other[0]])} mm"
+        raise InvalidInput(what, f"{seen:.0f}", f"about {expected:.0f}, as of {box}; {_WHOSE}")
+
+
+def _fits(image: BopImage, name: str) -> bool:
+    rows, columns = np.nonzero(image.masks[name])
+    if len(rows) < _LEAST_PIXELS:
+        return True
+    low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
+    place = image.camera.project(image.poses[name].position)
+    return bool(np.all((place > 2 * low - high) & (place < 2 * high - low)))
+
+
+def _extents(image: BopImage, name: str) -> tuple[float, float]:
+    """Return the diagonals of an upright rectangle around a mask, and around the object's box in the image [px]."""
+    rows, columns = np.nonzero(image.masks[name])
+    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * image.sizes[name]
+    points = image.poses[name].apply(corners)
+    points[:, 2] = np.maximum(points[:, 2], _NEAR_M)
+    pixels = np.clip(image.camera.project(points), 0, (image.camera.width, image.camera.height))
+    return float(np.hypot(np.ptp(rows) + 1, np.ptp(columns) + 1)), float(np.hypot(*np.ptp(pixels, axis=0)))
+
+
+def missing_parts(images: Sequence[BopImage]) -> tuple[str, ...]:
+    """Return sentences about what images of a scene lack, or show several times."""
+    found: dict[str, list[str]] = {}
+    for image in images:
+        parts = [] if image.poses or image.twice else ["without annotation of an object"]
+        parts += [f"with {name}, whose name nothing says" for name in image.poses if NUMBERED.fullmatch(name)]
+        parts += [f"without the file of the mask of {name}" for name in image.unmasked]
+        for part in (*parts, *(f"with {name} several times" for name in image.twice)):
+            found.setdefault(part, []).append(str(image.number))
+    return tuple(f"Image{'s' * (len(numbers) > 1)} {', '.join(numbers)}: {part}." for part, numbers in found.items())
 
 
 # A scene of a BOP data set as an observation over a table, and the annotated poses beside it.
@@ -673,12 +666,14 @@ class BopScene:
     Attributes:
         observation: cameras bear the numbers of their images.
         poses: `T_world_object` by name, as the first chosen image that shows the object annotates it.
-        left_out: other objects that are annotated in these images.
+        left_out: why other objects that are annotated in these images are not there, by name.
+        notes: sentences about what the images lack.
     """
 
     observation: Observation
     poses: Mapping[str, Pose]
-    left_out: tuple[str, ...]
+    left_out: Mapping[str, str]
+    notes: tuple[str, ...]
 
 
 def read_bop_scene(
@@ -693,21 +688,34 @@ def read_bop_scene(
     Args:
         folder: of the scene.
         choice: which images, and how they are read.
-        names: of the objects; None for all that are annotated and known.
+        names: of the objects; None for all that are annotated, each once, and known.
         table_prior: how a known object can lie, to find the table by how they do; None to take BOP's world for it.
         known: objects that can be estimated; None for all.
 
     Raises:
         CorruptFile: if a file is missing or broken.
-        InvalidInput: if images or objects are chosen that are not there, the cameras' places are missing, or BOP's
-            world is not the table's frame.
+        InvalidInput: if images or objects are chosen that are not there, or not once; nothing is annotated or masked;
+            the cameras' places are missing; BOP's world is not the table's frame; or annotations and masks do not fit.
     """
-    images = read_images(folder, choice)
-    there = tuple(sorted({name for image in images for name in image.poses}))
+    every = read_images(folder, choice)
+    images = tuple(image for image in every if image.poses)
+    if not any(image.masks for image in images):
+        allowed = f"in {SCENE_GT} and {_MASKS}, of one object at least; BOP's toolkit makes masks with calc_gt_masks.py"
+        raise InvalidInput("poses and masks of the objects", "missing", allowed)
+    check_scene(images)
+    left_out = {name: "there several times" for image in every for name in image.twice}
+    there = tuple(sorted({name for image in images for name in image.poses} - left_out.keys()))
     if names is None:
         names = tuple(name for name in there if known is None or name in known)
-    elif missing := [name for name in names if name not in there]:
-        raise InvalidInput("object", missing[0], f"one that scene_gt.json has: {', '.join(there) or 'none'}")
+        left_out |= {name: "without a field" for name in there if name not in names}
+    else:
+        if missing := [name for name in names if name not in there]:
+            given = left_out.get(missing[0], f"not in {SCENE_GT}")
+            raise InvalidInput(f"object {missing[0]}", given, f"one of {', '.join(there) or 'none'}")
+        left_out |= {name: "not asked for" for name in there if name not in names}
+    if not names:
+        reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
+        raise InvalidInput("number of objects", f"0 ({reasons})", "1 or more that are there once and have a field")
     cameras = _in_bop_world(images) if table_prior is None else _over_found_table(images, table_prior, known)
     poses = {
         name: next(c @ i.poses[name] for c, i in zip(cameras, images, strict=True) if name in i.poses) for name in names
@@ -720,8 +728,9 @@ def read_bop_scene(
     placed = tuple(replace(image.camera, T_world_camera=pose) for image, pose in zip(images, cameras, strict=True))
     pictures = np.stack([image.picture for image in images])
     masks = np.stack([[image.masks.get(name, hidden) for name in names] for image in images])
-    observation = Observation(placed, pictures, names, masks, None, 0.0)
-    return BopScene(observation, poses, tuple(name for name in there if name not in names))
+    unmasked = np.array([[name in image.unmasked for name in names] for image in images])
+    observation = Observation(placed, pictures, names, masks, None, 0.0, unmasked if unmasked.any() else None)
+    return BopScene(observation, poses, left_out, missing_parts(every))
 
 
 def _in_bop_world(images: Sequence[BopImage]) -> list[Pose]:

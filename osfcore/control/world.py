@@ -123,7 +123,8 @@ def without_cameras(observation: Observation, names: frozenset[str]) -> Observat
         return observation
     masks = None if observation.masks is None else observation.masks[kept]
     cameras = tuple(observation.cameras[v] for v in kept)
-    return replace(observation, cameras=cameras, images=observation.images[kept], masks=masks)
+    unmasked = None if observation.unmasked is None else observation.unmasked[kept]
+    return replace(observation, cameras=cameras, images=observation.images[kept], masks=masks, unmasked=unmasked)
 
 
 def brightness_change(before: Observation, now: Observation) -> float | None:

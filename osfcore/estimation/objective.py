@@ -373,6 +373,7 @@ class ObservedViews:
         pusher: centre of the pusher [m], or None.
         quality: quality of the renderings that are compared with the images.
         only: pixels that are compared; None for all.
+        unmasked: which of the masks nobody drew; None if all are there.
     """
 
     cameras: tuple[Camera, ...]
@@ -381,6 +382,7 @@ class ObservedViews:
     pusher: Float[np.ndarray, "3"] | None
     quality: Quality = QUALITY
     only: Bool[np.ndarray, "V h w"] | None = None
+    unmasked: Bool[np.ndarray, "V N"] | None = None
 
 
 def views_of(observation: Observation, side: int, *, samples: int = 1) -> ObservedViews:
@@ -400,7 +402,8 @@ def views_of(observation: Observation, side: int, *, samples: int = 1) -> Observ
     if masks is not None:
         masks = np.stack([[_resize(mask, size) for mask in view] for view in masks.astype(np.float32)])
         masks = masks.reshape(len(cameras), len(observation.names), size[1], size[0])
-    return ObservedViews(cameras, images, masks, observation.pusher, replace(QUALITY, samples_per_side=samples))
+    quality = replace(QUALITY, samples_per_side=samples)
+    return ObservedViews(cameras, images, masks, observation.pusher, quality, unmasked=observation.unmasked)
 
 
 def _resize(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h w *c"]:

@@ -73,6 +73,8 @@ def _table_pixels(views: ObservedViews, on_table: np.ndarray) -> np.ndarray:
     other = ~on_table
     if views.masks is not None and views.masks.shape[1]:
         other |= views.masks.max(axis=1) > 0
+        if views.unmasked is not None:  # the object may be anywhere
+            other |= np.any(views.unmasked, axis=1)[:, None, None]
     if views.pusher is not None:
         other |= _pusher_pixels(views)
     return np.stack([cv2.dilate(part.astype(np.uint8), kernel) == 0 for part in other])

@@ -48,7 +48,7 @@ class FitQuality:
         pixels: number of pixels of each object in each view: the sum of its rendered opacity.
         contrast: standard deviation of the image over the pixels of each object in all views [radiance].
         level: root mean square of the image over the same pixels [radiance].
-        overlap: overlap of rendered silhouettes and masks over all views (intersection over union); 1 without masks.
+        overlap: intersection over union of rendered silhouettes and masks, over views with a mask; 1 without masks.
         surroundings: root mean square error over all other pixels [radiance].
         spread: estimated variance of a pixel's error.
     """
@@ -81,8 +81,10 @@ def evaluate_fit(models: ObjectModels, views: ObservedViews, params: SceneParame
     elsewhere = 1 - opacity.sum(axis=1).clip(0, 1) if len(params.names) else np.ones_like(squares)
     overlap = np.ones(len(params.names))
     if views.masks is not None:
-        both = np.minimum(opacity, views.masks).sum(axis=(0, 2, 3))
-        either = np.maximum(opacity, views.masks).sum(axis=(0, 2, 3))
+        both, either = (f(opacity, views.masks).sum(axis=(2, 3)) for f in (np.minimum, np.maximum))
+        if views.unmasked is not None:
+            both, either = both * ~views.unmasked, either * ~views.unmasked
+        both, either = both.sum(axis=0), either.sum(axis=0)
         overlap = both / np.maximum(either, 1e-6)
     surroundings = float(np.sqrt((elsewhere * squares).sum() / max(elsewhere.sum(), 1e-6)))
     spread = float(squares.mean())

@@ -98,6 +98,7 @@ class Observation:
         masks: visible pixels of each object, or None. Only a first frame needs masks.
         pusher: centre of the pusher in the world [m], as the robot reports it; None without a pusher.
         time_s: time since the last reset [s].
+        unmasked: which of the masks nobody drew; None if all are there, so that an empty one means a hidden object.
 
     Example:
         >>> observation = Observation(cameras, images, state.names, masks, pusher, time_s=0.0)
@@ -111,6 +112,7 @@ class Observation:
     masks: Bool[np.ndarray, "V N h w"] | None
     pusher: Float[np.ndarray, "3"] | None
     time_s: float
+    unmasked: Bool[np.ndarray, "V N"] | None = None
 
 
 def pose_rows(poses: Pose) -> Float[np.ndarray, "N 7"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from osfcore.contrib.bop import BopImage, is_bop_scene, read_images, result_images
-from osfcore.errors import CorruptFile, InvalidInput, shown
+from osfcore.contrib.bop import BopImage, check_scene, is_bop_scene, missing_parts, read_images, result_images
+from osfcore.errors import CorruptFile, InvalidInput, OsfError, shown
 from osfcore.fields.kiloosf import FORMAT as FIELD_FORMAT
 from osfcore.fields.kiloosf import read_field, tensor_format
 from osfcore.fields.table import TABLE_FORMAT, read_table
@@ -32,42 +32,13 @@ from osfcore.inspection.overlays import (
 from osfcore.io.archives import unpack_set
 from osfcore.io.files import read_json
 from osfcore.io.image_file import to_uint8, write_png
-from osfcore.io.image_set import read_image_set, read_splits
+from osfcore.io.image_set import FROM_NERF, read_image_set, read_splits
 from osfcore.io.observation_file import OBSERVATION_FILE, is_observation, read_observation
 from osfcore.io.output_paths import check_place
 from osfcore.io.scene_file import actions_from_json, estimated_from_json, is_estimated, scene_from_json
 
-_SHARE = 0.5  # of the objects whose annotated place must fit their masks
-_LEAST_PIXELS = 20  # of a mask that counts
 _AXIS_M = 0.05
 _MOST_TILES, _SIDE = 8, 384
-
-
-def check_places(images: Sequence[BopImage]) -> None:
-    """Refuse a scene in which most objects are annotated elsewhere than their masks are.
-
-    An object's centre must project into the box of its visible pixels, grown by the box's own size to all sides.
-
-    Raises:
-        InvalidInput: naming the first that does not fit: K, or a pose, is of other images.
-    """
-    known = [(image, name) for image in images for name in image.masks if name in image.poses]
-    wrong = [(image, name) for image, name in known if not _fits(image, name)]
-    if len(wrong) > _SHARE * len(known):
-        image, name = wrong[0]
-        u, v = image.camera.project(image.poses[name].position)
-        what = f"place of {name} in image {image.number} by cam_K and cam_t_m2c [px]"
-        allowed = "where its mask is; cam_K may be of another image size, or the masks of another image"
-        raise InvalidInput(what, f"({u:.0f}, {v:.0f})", allowed)
-
-
-def _fits(image: BopImage, name: str) -> bool:
-    rows, columns = np.nonzero(image.masks[name])
-    if len(rows) < _LEAST_PIXELS:
-        return True
-    low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
-    place = image.camera.project(image.poses[name].position)
-    return bool(np.all((place > 2 * low - high) & (place < 2 * high - low)))
 
 
 def _tile(image: BopImage) -> UInt8[np.ndarray, "h w 3"]:
@@ -130,6 +101,8 @@ def check_path(path: Path) -> Report:
 
 
 def _any_json(data: object) -> Report:
+    if isinstance(data, dict) and isinstance(data.get("frames"), list):
+        raise OsfError(FROM_NERF)
     if isinstance(data, dict) and "actions" in data and "objects" not in data:
         count, steps = actions_from_json(data).shape[:2]
         return Report("actions", f"{count} sequences of {steps} actions", {"sequences": count, "steps": steps})
@@ -156,11 +129,12 @@ def _check_observation(folder: Path) -> Report:
 def _check_bop(folder: Path) -> Report:
     images = read_images(folder)
     try:
-        check_places(images)
+        check_scene(images)
     except InvalidInput as error:
         raise CorruptFile(folder, str(error).rstrip(".")) from None
     names = {name for image in images for name in image.poses}
-    facts = {"images": len(images), "objects": len(names), "masks": sum(len(image.masks) for image in images)}
+    facts: dict[str, Any] = {"images": len(images), "objects": len(names)}
+    facts |= {"masks": sum(len(image.masks) for image in images), "notes": missing_parts(images)}
     facts["cameras in a world"] = sum(image.T_camera_world is not None for image in images)
     world = "cameras in one world" if facts["cameras in a world"] == len(images) else "cameras without a common world"
     summary = f"{facts['images']} images of {facts['objects']} objects, {facts['masks']} masks, {world}"

@@ -19,6 +19,7 @@ from osfcore.io.image_set import ImageSet
 
 _COLUMNS = 4  # images of each set, and most images of an observation in a row
 _SIDE = 256
+_ROUNDING = 1e-9  # share of a point's coordinates at which its depth is none: it lies in the camera itself
 _NEAR = 1e-3  # share of a line's distance at which what lies behind the camera is cut off
 _BACKGROUND = 96
 AXIS_COLOURS = (0, 0, 255), (0, 255, 0), (255, 0, 0)  # x red, y green, z blue, BGR
@@ -96,7 +97,7 @@ def draw_line(
     """
     depth = camera.T_world_camera.inverse().apply(np.stack([a, b]))[:, 2]
     near = _NEAR * float(np.abs(depth).max())
-    if depth.max() <= near:
+    if depth.max() <= max(near, _ROUNDING * float(np.abs(a).max())):
         return
     if depth.min() < near:
         cut = a + (b - a) * (near - depth[0]) / (depth[1] - depth[0])

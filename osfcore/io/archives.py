@@ -16,6 +16,7 @@ from typing import BinaryIO
 
 from osfcore.errors import CorruptFile, OsfError
 from osfcore.io.files import folder_at_once, new_folder, writing
+from osfcore.io.image_set import FROM_NERF
 
 # The files that a zip lists are counted before the list is parsed: parsing takes memory and time for each.
 
@@ -269,6 +270,8 @@ def _wanted(
     depth = len(kind.marker.parts)
     roots = [p.parents[depth - 1] for p in members if PurePosixPath(*p.parts[-depth:]) == kind.marker]
     if not roots:
+        if kind is _IMAGE_SET and any(p.name.startswith("transforms") and p.suffix == ".json" for p in members):
+            raise CorruptFile(archive, FROM_NERF)
         raise CorruptFile(archive, f"it holds no {kind.marker}; {kind.expected} is expected")
     roots.sort(key=lambda root: len(root.parts))
     if len(roots) > 1 and len(roots[0].parts) == len(roots[1].parts):

@@ -30,6 +30,11 @@ MAX_IMAGES = 20_000
 MAX_ANNOTATION_BYTES = 64_000_000
 MAX_SPLIT_BYTES = 1 << 30  # of decoded images: both splits and the training itself stay below 4 GB
 OPAQUE = 128  # alpha from which a pixel counts as the object's
+FROM_NERF = (
+    "it is of a data set of instant-ngp or nerfstudio, which has camera-to-world matrices with OpenGL axes and no "
+    "lights; an image set has train/anno.json and test/anno.json with RT, K and light_pos of each image, where RT is "
+    "the inverse of transform_matrix diag(1, -1, -1, 1) without its last row"
+)
 _RIGID_TOLERANCE = 1e-3
 _MAX_NUMBER = 1e9  # in any unit of length a set may have
 Split = Literal["train", "test"]
@@ -129,6 +134,8 @@ def _images(folder: Path, split: Split) -> Iterator[tuple[Camera, Float[np.ndarr
 def _entries(folder: Path, split: Split, path: Path) -> list[Any]:
     try:
         if not path.is_file():
+            if (nerf := sorted(folder.glob("transforms*.json"))) and nerf[0].is_file():
+                raise CorruptFile(nerf[0], FROM_NERF)
             expected = "an image set holds train/anno.json and test/anno.json"
             raise CorruptFile(folder, f"it has no readable {split}/anno.json; {expected}")
         if path.stat().st_size > MAX_ANNOTATION_BYTES:

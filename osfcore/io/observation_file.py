@@ -3,10 +3,11 @@
 Layout: DIR/observation.json beside 8-bit PNGs.
 
     {"cameras": [as in scene.json], "images": {camera: file}, "objects": [names],
-     "masks": {camera: {object: file}}, "pusher": {"position": [3]} or null, "time_s": 0}
+     "masks": {camera: {object: file or null}}, "pusher": {"position": [3]} or null, "time_s": 0}
 
 Images are RGB; linear radiance is value / 255. Masks have a single channel, in which values above 127 show the object.
 `masks`, `pusher` and `time_s` may be missing. If there are masks, an object without one is not visible in that view.
+An object whose mask is null may be visible, but nobody drew it.
 """
 
 from __future__ import annotations
@@ -96,6 +97,8 @@ def _write_images(folder: Path, observation: Observation) -> dict[str, Any]:
             if mask.any():
                 files[name] = f"mask_{view}_{number}.png"
                 (folder / files[name]).write_bytes(encode_png(mask.astype(np.uint8) * 255))
+            elif observation.unmasked is not None and observation.unmasked[view, number]:
+                files[name] = None
     return {
         "cameras": [camera_to_json(camera) for camera in observation.cameras],
         "images": images,
@@ -109,9 +112,11 @@ def _write_images(folder: Path, observation: Observation) -> dict[str, Any]:
 def _check(observation: Observation) -> None:
     _check_listed(observation.cameras, observation.names)
     camera, views, count = observation.cameras[0], len(observation.cameras), len(observation.names)
-    shapes = {"images": (views, camera.height, camera.width, 3)}
+    shapes: dict[str, tuple[int, ...]] = {"images": (views, camera.height, camera.width, 3)}
     if observation.masks is not None:
         shapes["masks"] = (views, count, camera.height, camera.width)
+    if observation.unmasked is not None:
+        shapes["unmasked"] = (views, count)
     for name, shape in shapes.items():
         array = getattr(observation, name)
         if array.shape != shape or not np.all(np.isfinite(array)):
@@ -133,9 +138,14 @@ def _observation(folder: Path, data: object) -> Observation:
     if len(set(taken)) != len(taken):
         raise InvalidInput("files of the images", ", ".join(taken), "all different")
     images = np.stack([_read_image(folder, files[camera.name], camera) for camera in cameras])
-    masks = None if entry.masks is None else _read_masks(folder, entry.masks, cameras, names)
+    masks, unmasked = None, None
+    if entry.masks is not None:
+        masks = _read_masks(folder, entry.masks, cameras, names)
+        drawn = [{name: file is not None for name, file in entry.masks.get(c.name, {}).items()} for c in cameras]
+        undrawn = np.array([[not its.get(name, True) for name in names] for its in drawn])
+        unmasked = undrawn if undrawn.any() else None
     pusher = None if entry.pusher is None else np.array(entry.pusher.position)
-    return Observation(cameras, images, names, masks, pusher, entry.time_s)
+    return Observation(cameras, images, names, masks, pusher, entry.time_s, unmasked)
 
 
 def _check_listed(cameras: tuple[Camera, ...], names: tuple[str, ...]) -> None:
@@ -167,6 +177,8 @@ def _read_masks(
         files = by_camera.get(camera.name, {})
         check_known("object", files, names)
         for name, file in files.items():
+            if file is None:
+                continue
             path = _inside(folder, file, f"mask of {shown(name)} for camera {shown(camera.name)}")
             pixels = _read_png(path, camera, {_GREY: (1, 8)}, "8-bit grey, a single channel without transparency,")
             masks[view, names.index(name)] = pixels > _MASK_LEVEL

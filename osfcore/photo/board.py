@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.poses import Pose, quaternion_from_matrix
+from osfcore.photo.lens import Lens
 
 Grey = UInt8[np.ndarray, "h w"]
 Image8 = UInt8[np.ndarray, "h w *channels"]
@@ -638,37 +639,6 @@ _LEAST_BEND_PX = 0.5  # of distortion in the photograph's corners
 FINE_PX = 0.015  # of points, where the lens is modelled: they scatter by 0.01 px in VGA
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Lens:
-    """A camera with radial distortion.
-
-    Attributes:
-        intrinsics: 3 x 3 [px], pixel centres at +0.5.
-        radial: k1; 0 for none.
-        std: its standard deviation.
-    """
-
-    intrinsics: Intrinsics
-    radial: float
-    std: float = 0.0
-
-    def straightened(self, image: np.ndarray) -> np.ndarray:
-        """Return the same view without distortion, by the same intrinsics; beyond the photograph its edge repeats."""
-        if not self.radial:
-            return image
-        centre = self.intrinsics.copy()
-        centre[:2, 2] -= 0.5  # OpenCV counts indices
-        bend, size = np.array([self.radial, 0.0, 0.0, 0.0]), (image.shape[1], image.shape[0])
-        maps = cv2.initUndistortRectifyMap(centre, bend, np.eye(3), centre, size, cv2.CV_32FC1)
-        return cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-
-    def bent(self, points_px: Points) -> Points:
-        """Return where points of the straight photograph are in the one that was taken [px]."""
-        K = self.intrinsics
-        x = (points_px - K[:2, 2]) / K[[0, 1], [0, 1]]
-        return x * (1 + self.radial * (x**2).sum(axis=1, keepdims=True)) * K[[0, 1], [0, 1]] + K[:2, 2]
-
-
 def locate_board_through_lens(image: Image8, board: Board, intrinsics: Intrinsics | None) -> tuple[BoardView, Lens]:
     """Find the camera of a photograph that shows a board, and its lens; arguments and errors as of `locate_board`.
 
@@ -686,7 +656,7 @@ def locate_board_through_lens(image: Image8, board: Board, intrinsics: Intrinsic
             allowed = f"about {1 / ratio:.2f} times that, as the board in it shows; leave it out to have it found"
             raise InvalidInput(CONTRADICTED, f"given as {given:.0f} at {size[0]} x {size[1]} pixels", allowed)
     view = board_view(found, size, intrinsics)
-    return view, lens or Lens(view.intrinsics, 0.0)
+    return view, lens or Lens(view.intrinsics)
 
 
 def board_points_through_lens(
@@ -738,7 +708,7 @@ def _fitted(points_m: Points, points_px: Points, size: tuple[int, int], intrinsi
     reach = np.hypot(*size) / 2 / K[0, 0]  # of the corners from the middle, at distance 1
     if not (_SURE * std < abs(radial) < _MOST_RADIAL and abs(radial) * reach**3 * K[0, 0] > _LEAST_BEND_PX):
         return None
-    return Lens(K, radial, std)
+    return Lens(K, (radial,), std=std)
 
 
 # The page with the calibration board, to print.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -19,14 +18,11 @@ from osfcore.errors import CorruptFile, InvalidInput, OsfError, check_ranges, sh
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_from_matrix, quaternion_log
 from osfcore.geometry.workspace import TABLE_SIDE_M, WORKSPACE_HALF_M
-from osfcore.io.files import read_json
-from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, decode, encode
-from osfcore.io.scene_file import rigid_pose
+from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, encode
 from osfcore.photo.board import (
     ACCURACY_PX,
     FINE_PX,
     Board,
-    Lens,
     Points,
     board_points_through_lens,
     camera_matrix,
@@ -35,6 +31,7 @@ from osfcore.photo.board import (
     planar_pose,
     px_scale,
 )
+from osfcore.photo.lens import Lens
 from osfcore.photo.read_photograph import RawPhotograph
 
 Points3 = Float[np.ndarray, "N 3"]
@@ -121,7 +118,7 @@ class CameraFit:
     @property
     def lens(self) -> Lens:
         """The same camera as a lens."""
-        return Lens(matrix(self.theta), float(self.theta[3]))
+        return Lens(matrix(self.theta), (float(self.theta[3]),))
 
 
 def matrix(theta: Theta) -> Float[np.ndarray, "3 3"]:
@@ -595,13 +592,8 @@ def _check_agreement(every: Sequence[Sighting], fit: CameraFit) -> None:
 #     {"name", "T_world_camera": 4x4 | null, "K": 3x3, "width", "height", "radial", "focal_std_px", "corner_std_px",
 #      "expected_error_mm": {"mean", "worst"}, "reprojection_px": {photo: rms}}
 #
-# A camera as in scene.json, of photographs without distortion; `radial` is k1 of `osfcore.photo.board.Lens`, which
+# A camera as in scene.json, of photographs without distortion; `radial` is k1 of `osfcore.photo.lens.Lens`, which
 # straightens them. Pixels are those of the photographs as they were sent.
-
-
-_MOST_RADIAL = 2.0
-_FOCAL_RANGE = 0.2, 50.0  # per longest side
-_SHAPE = 0.005  # by which the ratio of a photograph's sides may differ: reduced photographs have whole pixels
 
 
 class ExpectedError(Entry):
@@ -626,34 +618,6 @@ class CalibrationJson(Entry):
     reprojection_px: dict[Text, FiniteFloat] = Field({}, description="By photo, root mean square.")
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class KnownCamera:
-    """A camera that was calibrated.
-
-    Attributes:
-        size: width and height of its photographs [px].
-        lens: in these pixels.
-        T_world_camera: where it stands; None if unknown.
-    """
-
-    size: Size
-    lens: Lens
-    T_world_camera: Pose | None
-
-    def lens_at(self, size: Size) -> Lens:
-        """Return the lens for photographs of this width and height [px].
-
-        Raises:
-            InvalidInput: if they have another shape, so that another camera took them, or they were cropped.
-        """
-        scale = np.divide(size, self.size)
-        if abs(scale[0] / scale[1] - 1) > _SHAPE:
-            allowed = f"of the shape that the camera was calibrated with, {self.size[0]} x {self.size[1]}, uncropped"
-            raise InvalidInput("size of the photo [px]", f"{size[0]} x {size[1]}", allowed)
-        K = self.lens.intrinsics * np.array([[scale[0]], [scale[1]], [1.0]])
-        return Lens(K, self.lens.radial)
-
-
 def calibration_to_json(found: Calibration, name: str) -> dict[str, Any]:
     """Return a calibration as plain lists and numbers."""
     pose = None if found.T_world_camera is None else found.T_world_camera.matrix().tolist()
@@ -673,31 +637,3 @@ def calibration_to_json(found: Calibration, name: str) -> dict[str, Any]:
             reprojection_px=dict(found.rms_px),
         )
     )
-
-
-def known_camera(data: object) -> KnownCamera:
-    """Return the camera of parsed JSON; cameras of scene.json are taken, too.
-
-    Raises:
-        InvalidInput: if something is missing or out of range.
-    """
-    entry = decode(CalibrationJson, data, "camera")
-    check_ranges(("radial of the camera", entry.radial, -_MOST_RADIAL, _MOST_RADIAL))
-    K, side = np.array(entry.K), max(entry.width, entry.height)
-    if not np.array_equal(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], (0, 0, 0, 0, 1)):
-        raise InvalidInput("K of the camera", K.tolist(), "[[f, 0, x], [0, f, y], [0, 0, 1]]")
-    low, high = np.multiply(_FOCAL_RANGE, side).tolist()
-    for number in (0, 1):
-        check_ranges(("focal length of the camera [px]", K[number, number], low, high))
-        check_ranges(("principal point of the camera [px]", K[number, 2], -side, 2 * side))
-    pose = None if entry.T_world_camera is None else rigid_pose(entry.T_world_camera, entry.name)
-    return KnownCamera((entry.width, entry.height), Lens(K, entry.radial), pose)
-
-
-def read_camera(path: Path) -> KnownCamera:
-    """Read a calibrated camera from a file.
-
-    Raises:
-        CorruptFile: if it cannot be read or is no camera; the message says why.
-    """
-    return read_json(path, known_camera)

@@ -19,13 +19,13 @@ from osfcore.photo.board import (
     Board,
     BoardView,
     Intrinsics,
-    Lens,
     locate_board,
     locate_board_through_lens,
 )
-from osfcore.photo.calibration import KnownCamera
+from osfcore.photo.camera_files import KnownCamera
 from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, FoundScene
 from osfcore.photo.lamp import LampFit, NearLampFit, photo_lamp, photo_light
+from osfcore.photo.lens import Lens
 from osfcore.photo.photograph import Photograph
 from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, PhotoPose, PhotoStep
 from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, intrinsics_from_focal
@@ -171,7 +171,7 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
             source = _guess_source(raw)
         notes.append("No printed board was found; the table is found from how the objects stand on it.")
         notes.append(f"If a board is in view: {error}")
-        return Located(raw, K, Lens(K, 0.0), source, None, tuple(notes), str(error))
+        return Located(raw, K, Lens(K), source, None, tuple(notes), str(error))
     if lens.radial:
         bend = f"k1 = {lens.radial:.3f}, as the board shows"
         notes.append(f"The lens bends straight lines ({bend}); the photo was straightened.")
@@ -189,8 +189,7 @@ def locate_calibrated(raw: RawPhotograph, camera: KnownCamera) -> Located:
     Raises:
         InvalidInput: if the photo has another shape than those that the camera was calibrated with.
     """
-    camera.lens_at(raw.sent_size)  # refuses it in the user's own pixels
-    lens = camera.lens_at((raw.encoded.shape[1], raw.encoded.shape[0]))
+    lens = camera.lens_at(raw.sent_size).scaled(np.divide(raw.encoded.shape[1::-1], raw.sent_size))
     straight = replace(raw, encoded=lens.straightened(raw.encoded))
     notes, pose, missing = [*raw.notes, "The camera is the one that was calibrated."], camera.T_world_camera, ""
     if pose is None:

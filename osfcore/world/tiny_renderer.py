@@ -111,6 +111,7 @@ def _projection_matrix(camera: Camera) -> list[float]:
     K, w, h = camera.intrinsics, camera.width, camera.height
     matrix = np.zeros((4, 4))
     matrix[0, 0], matrix[1, 1] = 2 * K[0, 0] / w, 2 * K[1, 1] / h
+    matrix[0, 1] = -2 * K[0, 1] / w  # skew; y points up here
     matrix[0, 2], matrix[1, 2] = 1 - 2 * K[0, 2] / w, 2 * K[1, 2] / h - 1
     matrix[2, 2] = -(_FAR_M + _NEAR_M) / (_FAR_M - _NEAR_M)
     matrix[2, 3] = -2 * _FAR_M * _NEAR_M / (_FAR_M - _NEAR_M)

@@ -1,11 +1,12 @@
 """A scene of ours in the format of BOP, written by its rules."""
 
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from osfcore.contrib.bop import NAMES
+from osfcore.contrib.bop import NAMES, read_objects
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.io.image_file import to_uint8, write_png
@@ -42,14 +43,32 @@ def annotation(T_camera_model: Pose, number: int) -> dict:
     return {"cam_R_m2c": R, "cam_t_m2c": (1e3 * T_camera_model.position).tolist(), "obj_id": number}
 
 
-def write_models_info(folder: Path, centres, size_mm=(60.0, 80.0, 100.0)) -> Path:
-    """models_info.json of models whose boxes' centres are given [m]."""
-    folder.mkdir()
+def box_masks(cameras, names, poses: Pose) -> np.ndarray:
+    """Upright rectangles around the boxes of YCB-V's objects, as masks."""
+    sizes, masks = [1e3 * read_objects(None)[NAMES.index(name) + 1].size for name in names], []
+    corners = np.array(list(product((-0.5e-3, 0.5e-3), repeat=3)))
+    for camera in cameras:
+        for number, size in enumerate(sizes):
+            pose = Pose(poses.position[number], poses.quaternion[number])
+            pixels = camera.project(pose.apply(corners * size)).round().astype(int)
+            (left, top), (right, bottom) = pixels.min(axis=0).clip(0), pixels.max(axis=0)
+            mask = np.zeros((camera.height, camera.width), bool)
+            mask[top:bottom, left:right] = True
+            masks.append(mask)
+    return np.reshape(masks, (len(cameras), len(names), *masks[0].shape))
+
+
+def write_models_info(folder: Path, centres, sizes_mm=None, names=None) -> Path:
+    """models_info.json of models whose boxes' centres are given [m], by YCB-V's name; with other sizes, and names."""
+    folder.mkdir(parents=True)
     info = {}
     for name, centre in centres.items():
-        low = 1e3 * np.asarray(centre) - np.array(size_mm) / 2
+        number = NAMES.index(name) + 1
+        size = (sizes_mm or {}).get(name, 1e3 * read_objects(None)[number].size)
+        low = 1e3 * np.asarray(centre) - np.array(size) / 2
         entry = {f"min_{a}": float(v) for a, v in zip("xyz", low, strict=True)}
-        entry |= {f"size_{a}": v for a, v in zip("xyz", size_mm, strict=True)}
-        info[str(NAMES.index(name) + 1)] = {"diameter": 140.0, **entry}
+        entry |= {f"size_{a}": float(v) for a, v in zip("xyz", size, strict=True)}
+        named = {"name": names[name]} if names else {}
+        info[str(number)] = {"diameter": 140.0, **entry, **named}
     (folder / "models_info.json").write_text(json.dumps(info))
     return folder

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from osfcore.geometry.poses import Pose
-from osfcore.photo.calibration import Calibration, KnownCamera, Sighting
+from osfcore.photo.calibration import Calibration, Sighting
+from osfcore.photo.camera_files import KnownCamera
 
 CameraSource = Literal["board", "given", "file", "objects", "assumed"]
 Points = tuple[tuple[float, float], ...]

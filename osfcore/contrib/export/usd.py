@@ -29,6 +29,7 @@ from osfcore.contrib.export.meshes import (
     light_matrix,
     scene_meshes,
 )
+from osfcore.errors import InvalidInput, shown
 from osfcore.extras import need
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.fields.table import TableField
@@ -130,6 +131,8 @@ def add_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: trimesh.Trimesh, matrix: Fl
 def add_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
     """Add a pinhole camera with exactly its K: an off-centre principal point becomes a shift of the film."""
     prim, K = UsdGeom.Camera.Define(stage, path), camera.intrinsics
+    if K[0, 1]:
+        raise InvalidInput(f"skew of camera {shown(camera.name)} (K[0][1])", K[0, 1], "0: USD's cameras have none")
     _place(prim, camera.T_world_camera.matrix() @ OPENCV_TO_GLTF)
     focal = _FILM * K[0, 0] / camera.width
     prim.CreateFocalLengthAttr(focal)

@@ -34,13 +34,13 @@ from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import PUSHER_RADIUS_M, STEP_S, check_action
 from osfcore.io.json_codec import Entry, Vector4, decode
 from osfcore.io.scene_file import CameraJson, PointJson, rigid_pose
+from osfcore.photo.lens import Lens
 from osfcore.photo.read_photograph import KEPT_SIDE as MOST_SIDE
 from osfcore.photo.read_photograph import read_photograph
 
 # Encoded images of a robot's cameras become linear radiance of moderate size, as in an `Observation`.
 
 KEPT_SIDE = 640  # larger pictures are reduced to this; estimates look at less
-HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV and ROS have pixel centres at whole numbers
 _DETAIL_CHARACTERS = 300  # of a robot's reason for a refusal
 
 
@@ -51,18 +51,16 @@ class SentCamera:
     Attributes:
         name: name of the camera.
         T_world_camera: pose of the camera over the table.
-        intrinsics: K of the pictures that are sent, pixel centres at +0.5 [px].
+        lens: intrinsics and distortion of the pictures that are sent.
         width: width of the pictures that are sent [px].
         height: height of the pictures that are sent [px].
-        distortion: coefficients of OpenCV's model; none for a pinhole camera.
     """
 
     name: str
     T_world_camera: Pose
-    intrinsics: Float[np.ndarray, "3 3"]
+    lens: Lens
     width: int
     height: int
-    distortion: tuple[float, ...] = ()
 
     def kept(self) -> Camera:
         """Return the camera of the pictures as they are kept.
@@ -75,8 +73,8 @@ class SentCamera:
             raise InvalidInput(what, f"{self.width} x {self.height}", f"between 1 and {MOST_SIDE} a side")
         scale = min(1.0, KEPT_SIDE / max(self.width, self.height))
         width, height = round(scale * self.width), round(scale * self.height)
-        ratio = np.array([[width / self.width], [height / self.height], [1.0]])
-        return Camera(self.name, self.T_world_camera, self.intrinsics * ratio, width, height)
+        lens = self.lens.scaled((width / self.width, height / self.height))
+        return Camera(self.name, self.T_world_camera, lens.intrinsics, width, height)
 
     def radiance(self, picture: bytes) -> Float32[np.ndarray, "h w 3"]:
         """Decode a JPEG or PNG file of this camera, sRGB, into linear radiance as `kept` sees it.
@@ -86,7 +84,8 @@ class SentCamera:
             InvalidInput: if it has another size than was described.
         """
         encoded = read_photograph(picture, most_pixels=MOST_SIDE**2).encoded
-        return self._resample(linear_from_encoded(encoded / np.iinfo(encoded.dtype).max, "srgb").astype(np.float32))
+        linear = linear_from_encoded(encoded / np.iinfo(encoded.dtype).max, "srgb").astype(np.float32)
+        return self._resample(linear).clip(0, 1)  # straightening overshoots a little
 
     def mask(self, picture: bytes) -> Bool[np.ndarray, "h w"]:
         """Decode a mask of this camera; values above 127 are the object.
@@ -103,9 +102,7 @@ class SentCamera:
             what = f"picture of camera {shown(self.name)} [px]"
             given = f"{image.shape[1]} x {image.shape[0]}"
             raise InvalidInput(what, given, f"{self.width} x {self.height}, as the robot describes it")
-        if any(self.distortion):
-            image = cv2.undistort(image, self.intrinsics - HALF_PIXEL, np.array(self.distortion))
-        kept = self.kept()
+        image, kept = self.lens.straightened(image), self.kept()
         size = (kept.width, kept.height)
         return image if size == (self.width, self.height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
@@ -195,7 +192,7 @@ class HttpRobot:
         try:
             answer = decode(RobotJson, self._json("robot"), f"answer of {self._url}/robot")
             self._cameras = tuple(
-                SentCamera(c.name, rigid_pose(c.T_world_camera, c.name), np.array(c.K), c.width, c.height)
+                SentCamera(c.name, rigid_pose(c.T_world_camera, c.name), Lens(np.array(c.K)), c.width, c.height)
                 for c in answer.cameras
             )
             limits = SafetyLimits((*answer.limits.box,), answer.limits.top_speed_m_s)  # pyright: ignore[reportArgumentType]

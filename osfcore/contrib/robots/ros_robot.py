@@ -19,7 +19,7 @@ from pydantic import Field, FiniteFloat
 from websockets.exceptions import ConnectionClosed, InvalidURI, WebSocketException
 from websockets.sync.client import connect
 
-from osfcore.contrib.robots.http_robot import HALF_PIXEL, SentCamera, observation_of
+from osfcore.contrib.robots.http_robot import SentCamera, observation_of
 from osfcore.contrib.robots.robot import (
     ANSWER_S,
     MOST_JSON_BYTES,
@@ -35,6 +35,7 @@ from osfcore.geometry.poses import Pose, unit_quaternion
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import STEP_S, check_action
 from osfcore.io.json_codec import Entry, decode
+from osfcore.photo.lens import lens_of
 
 # Poses of frames from ROS's transforms (tf2_msgs/TFMessage).
 
@@ -303,6 +304,7 @@ class _CameraInfo(Entry):
     height: int
     k: list[FiniteFloat] = Field(min_length=9, max_length=9)
     d: list[FiniteFloat] = Field(default=[])
+    distortion_model: str = ""
 
 
 class _Picture(Entry):
@@ -417,8 +419,9 @@ class RosRobot:
         tree = self._complete_tree([*(info.header.frame_id for info in infos.values()), self._topics.pusher])
         described = []
         for camera, info in infos.items():
-            pose, K = tree.pose(info.header.frame_id, self._topics.table), np.reshape(info.k, (3, 3)) + HALF_PIXEL
-            described.append(SentCamera(camera, pose, K, info.width, info.height, tuple(info.d)))
+            pose, K = tree.pose(info.header.frame_id, self._topics.table), np.reshape(info.k, (3, 3))
+            lens = lens_of(K, info.distortion_model, info.d, f"camera {camera}")
+            described.append(SentCamera(camera, pose, lens, info.width, info.height))
         return tuple(described)
 
     def _complete_tree(self, frames: list[str]) -> TransformTree:

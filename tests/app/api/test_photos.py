@@ -126,6 +126,21 @@ def test_a_picture_is_kept_as_the_goal_or_the_photograph_that_it_is(service):
     refuses(service.post("/api/pictures", content=b"{}", headers={"Content-Type": "application/json"}), 415, "photo")
 
 
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("photos", "image/jpeg"), ("pictures", "image/jpeg"), ("calibration/photos", "image/jpeg"),
+        ("goals", "image/jpeg"), ("estimates", "application/zip"), ("fields/sets", "application/zip"),
+        ("objects?name=a", "model/gltf-binary"),
+    ],
+)  # fmt: skip
+def test_a_file_in_a_form_is_refused_with_how_to_send_it(service, path, kind):
+    as_form = {"files": {"file": ("a.jpg", gray(), "image/jpeg")}}
+    as_curl_sends_it = {"content": gray(), "headers": {"Content-Type": "application/x-www-form-urlencoded"}}
+    for sent in (as_form, as_curl_sends_it):
+        refuses(service.post(f"/api/{path}", **sent), 415, f"Content-Type: {kind}")
+
+
 def test_the_board_can_be_printed(service):
     answer = service.get("/api/photos/board.pdf")
     assert answer.headers["content-type"] == "application/pdf"

@@ -120,7 +120,13 @@ def test_a_scene_of_bop_goes_in_and_its_poses_come_out(rendered, tmp_path, capsy
     write_bop_scene(tmp_path / "000048", *rendered)
     seen, state = tmp_path / "seen", tmp_path / "state.json"
     assert main(["import", "bop", str(tmp_path / "000048"), "--out", str(seen), "--images", "3", "9", "--json"]) == 0
-    assert result_of(capsys) == {"out": str(seen), "images": [3, 9], "objects": list(NAMES), "left_out": []}
+    assert result_of(capsys) == {
+        "out": str(seen),
+        "images": [3, 9],
+        "objects": list(NAMES),
+        "left_out": [],
+        "notes": [],
+    }
     assert [camera.name for camera in read_observation(seen).cameras] == ["3", "9"]
     poses = json.loads((seen / "poses.json").read_text())
     for name in NAMES:
@@ -187,6 +193,26 @@ def test_a_bad_set_is_drawn_before_it_is_refused(tmp_path, capsys):
         Check(folder, overlay=overlay).run()
     assert not overlay.exists()
     assert capsys.readouterr().out == ""
+
+
+def test_poses_as_nerf_has_them_are_told_with_an_overlay_and_without(tmp_path):
+    """Camera-to-world with OpenGL axes, read as world-to-camera, puts all cameras into one place."""
+    folder, overlay = write_set(tmp_path / "set"), tmp_path / "overlay.png"
+    turn_cameras(folder, lambda RT: (np.linalg.inv(np.vstack([RT, [0, 0, 0, 1]])) @ np.diag([1, -1, -1, 1]))[:3])
+    for place in (None, overlay):
+        with pytest.raises(CorruptFile, check=about("RT must be world-to-camera")):
+            Check(folder, overlay=place).run()
+    assert overlay.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("file", ["transforms.json", "transforms_train.json"])
+def test_data_sets_of_nerf_are_called_by_name(tmp_path, file):
+    frames = [{"file_path": "images/0.png", "transform_matrix": np.eye(4).tolist()}]
+    (tmp_path / file).write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    for path in (tmp_path, tmp_path / file):
+        for overlay in (None, tmp_path / "overlay.png"):
+            with pytest.raises(CorruptFile, check=about("instant-ngp or nerfstudio")):
+                Check(path, overlay=overlay).run()
 
 
 def test_an_overlay_of_another_kind_is_refused_for_good_and_bad_sets(tmp_path):

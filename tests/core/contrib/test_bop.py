@@ -5,30 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.io import savemat
 
-from osfcore.contrib.bop import (
-    BopChoice,
-    PoseChoice,
-    bop_results,
-    in_object_frame,
-    name_of,
-    read_bop_scene,
-    read_masks,
-    read_poses,
-    scene_gt_names,
-)
+from osfcore.contrib.bop import BopChoice, bop_results, read_bop_scene, read_masks
+from osfcore.contrib.pose_files import PoseChoice, read_poses
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
 from osfcore.estimation.objective import resting_orientations
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import default_cameras
-from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_to_matrix, rotation_angle
+from osfcore.geometry.poses import Pose, quaternion_exp, rotation_angle
 from osfcore.geometry.states import EstimatedState, Observation
 from osfcore.io.image_file import write_png
 from osfcore.photo.pose_loss import TablePrior
-from tests.support.bop_scenes import annotation, write_bop_scene, write_models_info
+from tests.support.bop_scenes import annotation, box_masks, write_bop_scene, write_models_info
 from tests.support.errors import about
 from tests.support.posed_scenes import NAMES, lying, scene, shipped_models
 
@@ -54,8 +42,9 @@ def rendered(fields):
     """Observation and true state of two objects that stand on the table; the pictures are noise."""
     rng, models = np.random.default_rng(3), shipped_models()
     state = scene({name: lying(models, name, 0, x, 0.03) for x, name in zip((-0.08, 0.1), NAMES, strict=True)})
-    images, masks = rng.integers(0, 256, (4, 64, 64, 3)) / 255, rng.random((4, 2, 64, 64)) > 0.5
-    return Observation(default_cameras(64), images.astype(np.float32), NAMES, masks, None, 0.0), state
+    images, cameras = rng.integers(0, 256, (4, 64, 64, 3)) / 255, default_cameras(64)
+    masks = box_masks(cameras, NAMES, state.poses) & (rng.random((4, 2, 64, 64)) > 0.5)
+    return Observation(cameras, images.astype(np.float32), NAMES, masks, None, 0.0), state
 
 
 @pytest.fixture
@@ -145,10 +134,55 @@ def test_the_table_is_found_without_objects_that_nobody_knows(folder, rendered, 
 
     edit(folder / "scene_gt.json", add_marker)
     found = read_bop_scene(folder, LINEAR, table_prior=prior, known=fields.names())
-    assert (found.observation.names, found.left_out) == (NAMES, ("040_large_marker",))
+    assert (found.observation.names, tuple(found.left_out)) == (NAMES, ("040_large_marker",))
     edit(folder / "scene_camera.json", without_places)
     with pytest.raises(InvalidInput, check=about("cam_R_w2c and cam_t_w2c of image 3")):
         read_bop_scene(folder, LINEAR, table_prior=prior)
+
+
+def test_an_object_that_is_there_twice_and_one_that_nobody_knows_are_left_out(folder):
+    def change(content):
+        content["9"] += [{**content["9"][1], "cam_t_m2c": [0, 0, 700]}, {**content["9"][0], "obj_id": 30}]
+        content["6"].append({**content["6"][0], "obj_id": 30, "cam_t_m2c": [0, 0, -500]})  # out of view
+
+    edit(folder / "scene_gt.json", change)
+    found = read_bop_scene(folder, LINEAR, known=NAMES)
+    assert found.observation.names == NAMES[:1]
+    assert {name: "several" in why for name, why in found.left_out.items()} == {NAMES[1]: True, "object 30": False}
+    assert [note for note in found.notes if "Image 9" in note and NAMES[1] in note]
+    assert [note for note in found.notes if "Image 9" in note and "object 30" in note]
+    refused(InvalidInput, f"object {NAMES[1]}", read_bop_scene, folder, LINEAR, NAMES)
+    assert read_bop_scene(folder, BopChoice((3, 6), "linear"), NAMES).observation.names == NAMES
+
+
+def test_images_without_annotation_are_left_out_and_missing_masks_told(folder, rendered):
+    edit(folder / "scene_gt.json", lambda content: content.pop("9"))
+    (folder / "mask_visib" / "000006_000001.png").unlink()
+    found = read_bop_scene(folder, LINEAR)
+    assert [camera.name for camera in found.observation.cameras] == ["3", "6", "12"]
+    assert found.observation.unmasked.tolist() == [[False, False], [False, True], [False, False]]
+    assert [note for note in found.notes if "Image 9" in note and "annotation" in note]
+    assert [note for note in found.notes if "Image 6" in note and NAMES[1] in note]
+    for mask in (folder / "mask_visib").iterdir():
+        mask.unlink()
+    refused(InvalidInput, "masks of the objects", read_bop_scene, folder, LINEAR)
+
+
+def test_objects_of_another_data_set_are_not_taken_for_those_of_ycb_video(folder, rendered, tmp_path):
+    """Neither where its models have other sizes, nor where the masks do; its own names count."""
+    models, sizes = tmp_path / "models", {NAMES[0]: (76.0, 78.0, 92.0)}
+    write_models_info(models, CENTRES, sizes)
+    for size in ("76 x 78 x 92", "71.8 x 164 x 213"):
+        refused(CorruptFile, size, read_bop_scene, folder, LINEAR)
+    (models / "models_info.json").unlink()
+    models.rmdir()
+    names = {NAMES[0]: "ape", NAMES[1]: "benchvise"}
+    write_models_info(models, dict.fromkeys(NAMES, np.zeros(3)), {name: (90.0, 150.0, 200.0) for name in NAMES}, names)
+    assert read_bop_scene(folder, LINEAR).observation.names == ("ape", "benchvise")
+    (models / "models_info.json").unlink()
+    edit(folder / "scene_gt.json", lambda c: [e.update(obj_id=6) for entries in c.values() for e in entries[:1]])
+    edit(folder / "scene_gt.json", lambda c: [entries.pop() for entries in c.values()])
+    refused(InvalidInput, "mask of 007_tuna_fish_can", read_bop_scene, folder, LINEAR)
 
 
 def without_places(content):
@@ -169,8 +203,7 @@ def in_metres(content):
         ("scene_camera.json", lambda c: c["3"].pop("cam_K"), "cam_K"),
         ("scene_camera.json", lambda c: c.clear(), "images"),
         ("scene_camera.json", lambda c: c["3"]["cam_R_w2c"].__setitem__(0, 3.0), "cam_R_w2c of image 3"),
-        ("scene_gt.json", lambda c: c["3"].append(c["3"][0]), "objects of image 3"),
-        ("scene_gt.json", lambda c: c["3"][0].update(obj_id=30), "number of the object"),
+        ("scene_gt.json", lambda c: c.clear(), "poses and masks"),
     ],
 )
 def test_scenes_that_make_no_sense_are_refused(folder, file, change, what):
@@ -190,7 +223,7 @@ def test_what_is_chosen_must_be_there(folder):
     refused(InvalidInput, "image", read_bop_scene, folder, BopChoice((4,)))
     refused(InvalidInput, "object", read_bop_scene, folder, LINEAR, ("025_mug",))
     known = read_bop_scene(folder, LINEAR, known=NAMES[:1])
-    assert (known.observation.names, known.left_out) == (NAMES[:1], NAMES[1:])
+    assert (known.observation.names, tuple(known.left_out)) == (NAMES[:1], NAMES[1:])
     (folder / "rgb" / "000003.png").unlink()
     refused(CorruptFile, "000003.png", read_bop_scene, folder)
     refused(CorruptFile, "scene_camera.json", read_bop_scene, folder / "rgb")
@@ -200,6 +233,7 @@ def test_what_is_chosen_must_be_there(folder):
 # Masks in folders: by name, and as BOP numbers them.
 
 
+POSE = Pose(np.array([0.05, -0.1, 0.8]), quaternion_exp(np.array([0.4, -1.2, 0.3])))
 KNOWN = ("025_mug", "003_cracker_box", "009_gelatin_box")
 SIZE, HALF = (80, 60), (40, 30)
 
@@ -228,7 +262,7 @@ def test_masks_of_bop(tmp_path, place):
         write_png(folder / f"{image:06d}_{index:06d}.png", mask_at(left))
     refused(InvalidInput, "scene_gt.json of the masks", read_masks, folder, KNOWN, (SIZE, SIZE), 1)
     content = {"1": [annotation(POSE, 14), annotation(POSE, 2)], "2": [annotation(POSE, 8)]}
-    write(folder / place, "scene_gt.json", content)
+    (folder / place / "scene_gt.json").write_text(json.dumps(content))
     masks = read_masks(folder, KNOWN, (SIZE, SIZE), 1)
     assert list(masks) == ["025_mug", "003_cracker_box"]
     assert masks["003_cracker_box"][20, 30]
@@ -248,126 +282,3 @@ def test_folders_without_masks_of_the_photo_are_refused(tmp_path):
         refused(InvalidInput, what, read_masks, tmp_path, *asked)
     (tmp_path / "025_mug.png").write_text("no picture")
     refused(CorruptFile, "025_mug.png", read_masks, tmp_path, *asked)
-
-
-# Poses of other programs: what is written is read, in the frame of the box's centre.
-
-
-HEADER = "scene_id,im_id,obj_id,score,R,t,time"
-POSE = Pose(np.array([0.05, -0.1, 0.8]), quaternion_exp(np.array([0.4, -1.2, 0.3])))
-
-
-def bop_line(pose=POSE, obj=14, scene=48, image=1, score=1.0):
-    parts = quaternion_to_matrix(pose.quaternion), 1e3 * pose.position
-    R, t = (" ".join(repr(float(v)) for v in np.ravel(part)) for part in parts)
-    return f"{scene},{image},{obj},{score},{R},{t},-1"
-
-
-def write(folder, name, content):
-    path = folder / name
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    return path
-
-
-@given(
-    turn=st.lists(st.floats(-1.8, 1.8), min_size=3, max_size=3),
-    position=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(0.1, 3.0)),
-    obj=st.integers(1, 21),
-)
-@settings(max_examples=15)
-def test_poses_survive_every_form(tmp_path_factory, turn, position, obj):
-    folder = tmp_path_factory.mktemp("poses")
-    pose, name = Pose(np.array(position), quaternion_exp(np.array(turn))), name_of(obj)
-    entry = {"position": pose.position.tolist(), "quaternion": pose.quaternion.tolist()}
-    written = [
-        write(folder, "bop.csv", f"{HEADER}\n{bop_line(pose, obj)}\n"),
-        write(folder, "bare.csv", bop_line(pose, obj)),
-        write(folder, "scene_gt.json", {"3": [annotation(pose, obj)]}),
-        write(folder, "plain.json", {name: entry}),
-        write(folder, "photo.json", {"poses_camera_object": {"mine": {name: entry}}, "image": "photo.png"}),
-    ]
-    for path in written:
-        ((read, found),) = read_poses(path).items()
-        assert read == name
-        assert same(found, pose)
-    rois, values = np.array([[0, obj, 1, 2, 3, 4]]), np.concatenate([pose.quaternion, pose.position])[None]
-    savemat(folder / "000001.mat", {"rois": rois, "poses": values, "poses_icp": values})
-    found = read_poses(folder / "000001.mat", PoseChoice(source="poses_icp"))
-    assert same(found[name], in_object_frame(pose, name, "ycb_video"))
-
-
-def test_the_frame_is_that_of_the_kind_of_file_unless_given_and_frames_differ_by_a_shift(tmp_path):
-    for name in ("025_mug", "061_foam_brick"):
-        assert same(in_object_frame(POSE, name, "bop"), POSE)
-        for frame in ("ycb_video", "google_16k"):
-            still = in_object_frame(Pose.identity(), name, frame)
-            assert same(in_object_frame(POSE, name, frame), POSE @ still)  # it turns with the object
-            assert 0 < np.linalg.norm(still.position) < 0.15
-    path = write(tmp_path, "bop.csv", bop_line())
-    given = read_poses(path, PoseChoice(frame="ycb_video"))["025_mug"]
-    assert same(given, in_object_frame(POSE, "025_mug", "ycb_video"))
-    path = write(tmp_path, "bop.csv", bop_line(obj=17))
-    assert "037_scissors" in read_poses(path)
-    refused(UnknownName, "037_scissors", read_poses, path, PoseChoice(frame="google_16k"))
-
-
-def test_the_best_score_counts_and_rows_of_posecnn_without_a_pose_do_not(tmp_path):
-    other = Pose(POSE.position + 0.1, POSE.quaternion)
-    lines = [bop_line(other, score=0.2), bop_line(score=0.9), bop_line(other, score=0.5)]
-    assert same(read_poses(write(tmp_path, "bop.csv", "\n".join(lines)))["025_mug"], POSE)
-    poses = np.stack([np.zeros(7), np.concatenate([POSE.quaternion, POSE.position])])
-    savemat(tmp_path / "a.mat", {"rois": np.array([[0, 1, 0, 0, 9, 9, 0.9], [0, 14, 0, 0, 9, 9, 0.8]]), "poses": poses})
-    assert list(read_poses(tmp_path / "a.mat")) == ["025_mug"]
-
-
-def test_images_and_scenes_are_chosen(tmp_path):
-    lines = [HEADER, bop_line(), bop_line(obj=1, image=36), bop_line(obj=2, scene=50)]
-    path = write(tmp_path, "bop.csv", "\n".join(lines))
-    refused(InvalidInput, "scene of the poses", read_poses, path)
-    refused(InvalidInput, "image of the poses", read_poses, path, PoseChoice(7, 48))
-    assert list(read_poses(path, PoseChoice(36, 48))) == ["002_master_chef_can"]
-    content = {"1": [annotation(POSE, 14)], "36": [annotation(POSE, 5), annotation(POSE, 2)]}
-    gt = write(tmp_path, "scene_gt.json", content)
-    assert list(read_poses(gt, PoseChoice(1))) == ["025_mug"]
-    assert scene_gt_names(gt, 36) == ("006_mustard_bottle", "003_cracker_box")
-
-    entry = {"025_mug": {"position": [0, 0, 1], "quaternion": [1, 0, 0, 0]}}
-    path = write(tmp_path, "photo.json", {"poses_camera_object": {"posecnn_raw": entry, "truth": entry}})
-    refused(CorruptFile, "source of the poses", read_poses, path)
-    assert list(read_poses(path, PoseChoice(source="truth"))) == ["025_mug"]
-
-
-ONE = "1 0 0 0 1 0 0 0 1"
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "what"),
-    [
-        ("a.txt", "", "poses come in"),
-        ("a.csv", HEADER, "no poses"),
-        ("a.csv", "1,2,3", "pose 1"),
-        ("a.csv", "48,1,14,1.0,1 0 0 0 1 0 0 0,0 0 800,-1", "8 and 3 numbers"),
-        ("a.csv", "48,1,14,1.0,1 0 0 0 1 0 0 0 2,0 0 800,-1", "rotation"),
-        ("a.csv", "48,1,14,1.0,1 0 0 0 1 0 0 0 -1,0 0 800,-1", "rotation"),
-        ("a.csv", "48,1,14,1.0,nan 0 0 0 1 0 0 0 1,0 0 800,-1", "rotation"),
-        ("a.csv", "48,1,14,1.0,inf 0 0 0 1 0 0 0 1,0 0 800,-1", "rotation"),
-        ("a.csv", f"48,1,14,1.0,{ONE},nan 0 800,-1", "position"),
-        ("a.csv", f"48,1,14,1.0,{ONE},0 0 0.8,-1", "read as mm"),
-        ("a.csv", f"48,1,99,1.0,{ONE},0 0 800,-1", "number of the object"),
-        ("a.csv", 200_000 * "x", "table of values"),
-        ("a.json", "[", "JSON"),
-        ("a.json", {"025_mug": {"position": [0, 0, 1], "quaternion": [1, 1, 0, 0]}}, "quaternion of 025_mug"),
-        ("a.json", {"025_mug": {"position": [0, 0, 800], "quaternion": [1, 0, 0, 0]}}, "read as m,"),
-        ("a.json", {"1": [{"obj_id": 14}]}, "cam_R_m2c"),
-        ("a.mat", "no matlab", "MATLAB"),
-        ("a.mat", {"x": 1}, "'rois'"),
-        ("a.mat", {"rois": np.zeros((2, 6)), "poses": np.zeros((1, 7))}, "poses are not"),
-        ("a.mat", {"rois": np.full((1, 6), 99), "poses": np.ones((1, 7))}, "number of the object"),
-    ],
-)
-def test_files_without_sound_poses_are_refused(tmp_path, name, content, what):
-    if name.endswith(".mat") and isinstance(content, dict):
-        savemat(tmp_path / name, content)
-    else:
-        write(tmp_path, name, content)
-    refused(CorruptFile, what, read_poses, tmp_path / name)

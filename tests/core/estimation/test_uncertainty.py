@@ -75,6 +75,11 @@ def test_fit_of_the_truth_is_perfect_and_evidence_is_of_each_objects_pixels(mode
     np.testing.assert_allclose(fit.pixels, own.masks.sum(axis=(2, 3)), rtol=1e-5)
     assert fit.surroundings == fit.spread == 0
     assert evaluate_fit(models, replace(own, masks=None), params_of(truth)).overlap.tolist() == [1, 1]
+    masks, unmasked = own.masks.copy(), np.zeros(own.masks.shape[:2], bool)
+    masks[0, 1], unmasked[0, 1] = 0, True
+    hidden, undrawn = replace(own, masks=masks), replace(own, masks=masks, unmasked=unmasked)
+    assert evaluate_fit(models, hidden, params_of(truth)).overlap[1] < 0.95
+    np.testing.assert_allclose(evaluate_fit(models, undrawn, params_of(truth)).overlap, 1, atol=1e-12)
     darker = own.images.copy()
     darker[1][own.masks[1, 0] > 0] -= np.float32(0.2)  # the box, in one view
     fit = evaluate_fit(models, replace(own, images=darker), params_of(truth))

@@ -16,7 +16,7 @@ from osfcore.inspection.check import check_path, draw_overlay
 from osfcore.io.observation_file import write_observation
 from osfcore.io.push_file import EpisodeFolder, PushEpisode, save_episode
 from osfcore.io.scene_file import write_estimated
-from tests.support.bop_scenes import write_bop_scene
+from tests.support.bop_scenes import box_masks, write_bop_scene
 from tests.support.ellipsoid_sets import turn_cameras, write_set
 from tests.support.errors import about
 
@@ -142,13 +142,10 @@ PLACES = np.array([[0.05, 0.1, 0.08], [-0.1, -0.05, 0.04]])
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two objects, whose masks are squares around their centres."""
-    cameras = default_cameras(64)
-    masks = np.zeros((4, 2, 64, 64), bool)
-    for view, camera in enumerate(cameras):
-        for number, (u, v) in enumerate(camera.project(PLACES).astype(int)):
-            masks[view, number, v - 4 : v + 4, u - 4 : u + 4] = True
-    state = SceneState(NAMES, Pose(PLACES, np.tile([1.0, 0, 0, 0], (2, 1))), Light(np.array([0, 0, 1.0])), None)
+    """Two objects, whose masks are rectangles around their boxes."""
+    cameras, poses = default_cameras(64), Pose(PLACES, np.tile([1.0, 0, 0, 0], (2, 1)))
+    masks = box_masks(cameras, NAMES, poses)
+    state = SceneState(NAMES, poses, Light(np.array([0, 0, 1.0])), None)
     observation = Observation(cameras, np.full((4, 64, 64, 3), 0.4), NAMES, masks, None, 0.0)
     return write_bop_scene(tmp_path / "000001", observation, state)
 
@@ -161,7 +158,7 @@ def edit_bop(path, change):
 
 
 def test_a_good_scene_passes_and_its_overlay_shows_the_objects(folder, tmp_path):
-    facts = {"images": 4, "objects": 2, "masks": 8, "cameras in a world": 4}
+    facts = {"images": 4, "objects": 2, "masks": 8, "notes": (), "cameras in a world": 4}
     assert described(folder) == ("scene of BOP", facts)
     assert drawn(folder, tmp_path, *AXES) == (288, 4 * 384, 3)
     edit_bop(folder / "scene_camera.json", lambda entry: entry.pop("cam_R_w2c"))

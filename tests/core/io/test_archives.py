@@ -137,6 +137,9 @@ def test_archives_without_a_set_or_with_two_are_refused(archive, tmp_path):
     for name in ("several", "none", "notes", "gone"):
         with pytest.raises(CorruptFile, check=about(f"{name}.zip")):
             unpack_set(tmp_path / f"{name}.zip", tmp_path / "out")
+    add(tmp_path / "nerf.zip", "scene/transforms_train.json")
+    with pytest.raises(CorruptFile, check=about("nerfstudio")):
+        unpack_set(tmp_path / "nerf.zip", tmp_path / "out")
     add(two, "deeper/train/anno.json")  # the one nearer the top counts
     unpack_set(two, tmp_path / "out")
     with pytest.raises(InvalidInput):

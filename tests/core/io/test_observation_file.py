@@ -158,9 +158,12 @@ def test_mistakes_are_refused_with_their_place(folder, datum, path, values):
 
 def test_what_may_be_missing_may_be_missing(folder):
     edit(folder, ("masks", "left", NAMES[0]), ...)
-    edit(folder, ("masks", "right"), ...)
-    masks = read_observation(folder).masks
-    assert masks.any(axis=(2, 3)).tolist() == [[False, True], [False, False]]
+    edit(folder, ("masks", "right"), {NAMES[1]: None})  # nobody drew it
+    read = read_observation(folder)
+    assert read.masks.any(axis=(2, 3)).tolist() == [[False, True], [False, False]]
+    assert read.unmasked.tolist() == [[False, False], [False, True]]
+    write_observation(folder / "again", read)
+    assert read_observation(folder / "again").unmasked.tolist() == read.unmasked.tolist()
     for key in ("masks", "pusher", "time_s"):
         edit(folder, (key,), ...)
     read = read_observation(folder)

@@ -12,7 +12,6 @@ from osfcore.geometry.poses import rotation_angle
 from osfcore.photo.board import (
     RULER_M,
     Board,
-    Lens,
     board_pdf,
     board_points,
     board_view,
@@ -22,6 +21,7 @@ from osfcore.photo.board import (
     page_image,
     planar_pose,
 )
+from osfcore.photo.lens import Lens
 from tests.support.errors import about
 
 VGA = (640, 480)
@@ -189,7 +189,7 @@ def test_without_distortion_the_camera_is_the_same_and_a_focal_length_that_the_b
 
 @pytest.mark.parametrize("radial", [-0.08, 0.12])
 def test_straightening_moves_what_is_bent_back(radial):
-    lens, straight = Lens(K, radial), np.array([[100.5, 60.5], [320.5, 240.5], [500.5, 400.5]])
+    lens, straight = Lens(K, (radial,)), np.array([[100.5, 60.5], [320.5, 240.5], [500.5, 400.5]])
     rows, columns = np.mgrid[:480, :640] + 0.5
     spots = [np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 18) for x, y in lens.bent(straight)]
     flat = lens.straightened(np.sum(spots, axis=0).astype(np.float32))

@@ -14,16 +14,8 @@ from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.io.files import write_json
 from osfcore.io.scene_file import camera_from_json
 from osfcore.photo.board import planar_pose
-from osfcore.photo.calibration import (
-    assess,
-    board_place,
-    calibrated_camera,
-    calibration_to_json,
-    known_camera,
-    read_camera,
-    sight,
-    workspace_grid,
-)
+from osfcore.photo.calibration import assess, board_place, calibrated_camera, calibration_to_json, sight, workspace_grid
+from osfcore.photo.camera_files import known_camera, read_camera
 from osfcore.photo.read_photograph import RawPhotograph
 from osfcore.photo.summary import locate, locate_calibrated
 from tests.support.boards import RADIAL, SIZE, VARIED, K, on_table, project, sighting, sightings
@@ -84,6 +76,19 @@ def test_a_photograph_is_straightened_and_placed_as_calibrated(camera_json, raw)
     assert assumed.T_world_camera is None
     with pytest.raises(InvalidInput, check=about("focal length")):
         locate(blank, 1.0)
+
+
+@pytest.mark.slow
+def test_a_photograph_is_straightened_by_the_camera_of_another_program(raw, tmp_path):
+    sent = 4 * K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 3]]
+    (tmp_path / "camera_info.yaml").write_text(
+        f"image_width: {4 * SIZE[0]}\nimage_height: {4 * SIZE[1]}\ndistortion_model: plumb_bob\n"
+        f"camera_matrix: {{rows: 3, cols: 3, data: {sent.ravel().tolist()}}}\n"
+        f"distortion_coefficients: {{rows: 1, cols: 5, data: [{RADIAL}, 0, 0, 0, 0]}}\n"
+    )
+    located = locate_calibrated(raw, read_camera(tmp_path / "camera_info.yaml"))
+    np.testing.assert_allclose(located.T_world_camera.matrix(), POSE.matrix(), atol=2e-3)
+    np.testing.assert_allclose(located.intrinsics, K, atol=1e-9)
 
 
 def test_corners_are_in_pixels_of_the_photograph_as_it_was_sent(raw):

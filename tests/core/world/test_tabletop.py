@@ -191,7 +191,9 @@ def test_episodes_of_random_pushes_never_explode(tables, seeds):
 
 @pytest.mark.slow
 def test_tiny_renderer_sees_the_same_scene_as_ray_tracing(tables):
-    cameras = (goal_camera(128), default_cameras(128)[1])
+    skewed = goal_camera(128)
+    skewed = replace(skewed, intrinsics=skewed.intrinsics + [[0, 25.0, 0], [0, 0, 0], [0, 0, 0]])
+    cameras = (goal_camera(128), default_cameras(128)[1], skewed)
     exact, tiny = tables(1), tables(conditions=Conditions(renderer="tiny"))
     tiny.load(exact.truth())
     for a, b in zip(exact.pictures(cameras), tiny.pictures(cameras), strict=True):

@@ -1,6 +1,7 @@
 """Exported scenes as Pixar's library reads them: geometry, colours, cameras and light; its own checks find nothing."""
 
 import io
+from dataclasses import replace
 from zipfile import ZipFile
 
 import numpy as np
@@ -9,9 +10,11 @@ from PIL import Image
 from pxr import Ar, Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
 from osfcore.contrib.export.usd import field_usd, scene_usdz
+from osfcore.errors import InvalidInput
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.cameras import Camera, default_cameras
 from osfcore.io.scene_file import Scene
+from tests.support.errors import about
 
 MUSTARD = "006_mustard_bottle"
 OFF_CENTRE = Camera(
@@ -97,6 +100,12 @@ def test_cameras_see_points_where_ours_do(stage, camera):
     seen = np.array([matrix.Transform(Gf.Vec3d(*point)) for point in shown_with_y_up(points).tolist()])
     pixels = np.stack([(1 + seen[:, 0]) / 2 * camera.width, (1 - seen[:, 1]) / 2 * camera.height], axis=1)
     np.testing.assert_allclose(pixels, camera.project(points), atol=1e-3)
+
+
+def test_a_camera_with_skew_is_refused_since_usd_has_none(scene, shapes, one_thread):
+    skewed = replace(OFF_CENTRE, intrinsics=OFF_CENTRE.intrinsics + [[0, 2.0, 0], [0, 0, 0], [0, 0, 0]])
+    with pytest.raises(InvalidInput, check=about("skew of camera off centre")):
+        scene_usdz(Scene(scene.state, (skewed,)), shapes, FieldLibrary(None).load_table())
 
 
 def source_of(prim, name):

@@ -20,6 +20,7 @@ from osfcore.contrib.robots.robot import ConnectionLost, RobotRefused, RobotStop
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import encode_png
+from osfcore.photo.lens import Lens
 from tests.live import free_port
 from tests.support.errors import about
 from tests.support.robots import NAMES, dripping, example, serving, until
@@ -277,9 +278,9 @@ def test_closing_lets_a_stop_from_another_thread_arrive(odd):
 LOOK = Camera.look_at("side", (0.6, 0.1, 0.5), (0, 0, 0), size=64)
 
 
-def sent(width, height, focal, distortion=()):
+def sent(width, height, focal, coefficients=()):
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return SentCamera("side", LOOK.T_world_camera, K, width, height, distortion)
+    return SentCamera("side", LOOK.T_world_camera, Lens(K, coefficients), width, height)
 
 
 def test_large_pictures_are_reduced_and_points_stay_where_they_are():
@@ -287,7 +288,7 @@ def test_large_pictures_are_reduced_and_points_stay_where_they_are():
     kept = camera.kept()
     assert (kept.width, kept.height) == (640, 360)
     point = np.array([0.05, -0.03, 0.02])
-    whole = Camera("side", LOOK.T_world_camera, camera.intrinsics, 1024, 720)
+    whole = Camera("side", LOOK.T_world_camera, camera.lens.intrinsics, 1024, 720)
     np.testing.assert_allclose(kept.project(point), whole.project(point) / 2, atol=1e-12)
     assert camera.radiance(encode_png(np.zeros((720, 1280, 3), np.uint8))).shape == (360, 640, 3)
 
@@ -295,14 +296,15 @@ def test_large_pictures_are_reduced_and_points_stay_where_they_are():
 def test_bent_lines_are_straightened():
     """A dot is drawn where OpenCV's model projects it to, and found where a pinhole would."""
     camera = sent(320, 240, 250.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
-    K = camera.intrinsics - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    K = camera.lens.intrinsics - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     point = np.array([[0.4, -0.3, 1.0]])
-    bent = cv2.projectPoints(point, np.zeros(3), np.zeros(3), K, np.array(camera.distortion))[0].ravel()
+    bent = cv2.projectPoints(point, np.zeros(3), np.zeros(3), K, np.array(camera.lens.coefficients))[0].ravel()
     straight = (K @ point[0])[:2]
     assert np.linalg.norm(bent - straight) > 4
     picture = np.zeros((240, 320, 3), np.uint8)
     cv2.circle(picture, np.round(16 * bent).astype(int).tolist(), 16 * 3, (255, 255, 255), -1, cv2.LINE_AA, 4)
     found = camera.radiance(encode_png(picture))[..., 0]
+    assert 0 <= found.min() <= found.max() <= 1
     rows, columns = np.indices(found.shape)
     np.testing.assert_allclose([np.average(axis, weights=found) for axis in (columns, rows)], straight, atol=0.3)
 

@@ -1,6 +1,7 @@
 import contextlib
 import threading
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,7 +17,7 @@ from osfcore.geometry.poses import Pose, quaternion_exp
 from tests.live import free_port
 from tests.support.errors import about
 from tests.support.robots import until
-from tests.support.ros_robots import CAMERAS, StandIn, transform
+from tests.support.ros_robots import CAMERAS, SIDE, StandIn, jpeg, transform
 from tests.support.same import assert_same
 
 FAST = SafetyLimits(top_speed_m_s=0.42)
@@ -159,6 +160,32 @@ def test_a_camera_that_is_not_calibrated_is_refused(stand_in):
     stand_in.extra["/left/camera_info"] = info | {"k": [0.0] * 9}
     with pytest.raises(InvalidInput, check=about("K of camera left")):
         short(stand_in)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "what"),
+    [("fov", [0.9], "distortion_model of camera left"), ("plumb_bob", [0.1] * 6, "distortion of camera left")],
+)
+def test_a_lens_that_is_not_modelled_is_refused(stand_in, model, coefficients, what):
+    info = stand_in.messages()["/left/camera_info"]
+    stand_in.extra["/left/camera_info"] = info | {"distortion_model": model, "d": coefficients}
+    with pytest.raises(InvalidInput, check=about(what)):
+        short(stand_in)
+
+
+def test_the_pictures_of_a_fisheye_are_straightened(stand_in):
+    info, coefficients = stand_in.messages()["/left/camera_info"], [-0.05, 0.01, 0.0, 0.0]
+    ramp = np.broadcast_to(np.linspace(20, 235, SIDE), (SIDE, SIDE))
+    stand_in.pictures["left"] = jpeg(np.repeat(ramp[..., None], 3, axis=2).astype(np.uint8))
+    with contextlib.closing(connect(stand_in.url)) as robot:
+        plain = robot.observe().images[0]
+    stand_in.extra["/left/camera_info"] = info | {"distortion_model": "equidistant", "d": coefficients}
+    with contextlib.closing(connect(stand_in.url)) as robot:
+        straight = robot.observe().images[0]
+    K = np.reshape(info["k"], (3, 3))
+    expected = cv2.fisheye.undistortImage(plain, K, np.array(coefficients), Knew=K)
+    assert np.abs(straight - plain).max() > 0.05
+    np.testing.assert_allclose(straight, expected, atol=0.005)
 
 
 @pytest.mark.parametrize(
