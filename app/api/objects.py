@@ -52,7 +52,7 @@ class ObjectList(BaseModel):
 UPLOAD_PATH = "/api/objects"
 router = APIRouter(prefix=UPLOAD_PATH, tags=["objects"], responses=problems())
 Name = Annotated[str, Path(examples=["006_mustard_bottle"])]
-_MESH_BODY = upload("model/gltf-binary", "application/zip")
+_MESH_BODY = upload("model/gltf-binary", "application/zip", "application/octet-stream")
 
 
 @router.get("")
@@ -82,10 +82,10 @@ async def add(
         float, Query(ge=1e-6, le=1e6, description="Metres for one unit of the file, such as 0.001 for millimetres.")
     ] = 1.0,
     licence: Annotated[Label, Query(description="Of the mesh.")] = "unknown",
-    file_name: Annotated[FileName, Query(description="What the file is called, for people.")] = "mesh",
+    file_name: Annotated[FileName, Query(description="What the file is called; its end tells PLY from STL.")] = "mesh",
 ) -> JobOut:
-    """Add an object from a GLB, or from a zip of an OBJ with its MTL and texture; answers the job that makes it."""
-    refuse_form(request, "model/gltf-binary or application/zip")
+    """Add an object from a GLB, PLY or STL, or from a zip of a mesh with the files that it names; answers the job."""
+    refuse_form(request, "model/gltf-binary, application/zip or application/octet-stream")
     new = NewObject(name, mass_kg, label, scale, licence)
     job = await services.own_objects.receive(new, request.stream(), file_name)
     response.headers["Location"] = f"/api/jobs/{job.id}"

@@ -64,13 +64,13 @@ class OwnObjects:
 
         Args:
             new: what is said of it.
-            chunks: a GLB, or a zip of an OBJ with its MTL and texture.
-            file_name: what the uploader calls it.
+            chunks: a mesh in one file, or a zip of one with the files that it names.
+            file_name: what the uploader calls it; its end tells the format of all but GLB and zip.
 
         Raises:
             InvalidInput: if name, mass, scale or label are out of range.
             ObjectTaken: if the name is taken, or will be.
-            MeshRefused: if it is neither a GLB nor a zip.
+            MeshRefused: if it is neither.
             StorageFull, CannotStore, QueueFull: if there is no room for it.
         """
         await run_in_threadpool(self._check, new)
@@ -110,7 +110,7 @@ class OwnObjects:
         from osfcore.objects.mesh import check_upload  # loads trimesh, which the page's start need not wait for
 
         try:
-            check_upload(folder / UPLOAD)
+            check_upload(folder / UPLOAD, file_name)
         except CorruptFile as error:
             raise MeshRefused(str(error).replace(str(folder / UPLOAD), "The uploaded file")) from error
         self._check(new)  # others may have come in since the upload began

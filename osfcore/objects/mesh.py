@@ -11,7 +11,7 @@ import re
 import shutil
 import tempfile
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -32,39 +32,47 @@ if TYPE_CHECKING:
     import trimesh
 
 
-# A mesh that a stranger sends: one GLB, or a zip with a mesh and the files that it names. Nothing in it is trusted.
+# A mesh that a stranger sends: one file, or a zip with a mesh and the files that it names. Nothing in it is trusted.
 
 
 MAX_UNPACKED_BYTES = 1 << 30
 MAX_FILES = 1000
 _GLB_MAGIC, _ZIP_MAGIC = b"glTF", b"PK"
 _RANKS = ((".obj", ".glb", ".gltf"), (".ply",), (".stl", ".off"))  # scans come with copies that have fewer colours
-_EXPECTED = "a GLB, or a zip of an OBJ with its MTL and texture"
-_GLB_NAME = "the uploaded mesh.glb"  # as messages call it
+_EXPECTED = "a GLB, PLY or STL, or a zip of an OBJ with its MTL and texture"
+_ZIP = ".zip"
 
 
-def check_upload(file: Path) -> bool:
-    """Return whether an upload is a GLB, not a zip, and refuse what is neither; this takes milliseconds.
+def check_upload(file: Path, name: str) -> str:
+    """Return the format of an upload as the end of a file name, such as ".glb" or ".zip"; this takes milliseconds.
+
+    Args:
+        file: GLB and zip are known by their first bytes.
+        name: what its owner calls it; all other formats are known by its end.
 
     Raises:
-        CorruptFile: if it is neither.
+        CorruptFile: if it is of no format of meshes, or the zip is damaged.
     """
     with file.open("rb") as source:
         magic = source.read(4)
     if magic == _GLB_MAGIC:
-        return True
-    if not magic.startswith(_ZIP_MAGIC):
-        raise CorruptFile(file, f"it is neither a GLB nor a zip; send {_EXPECTED}")
-    check_zip(file, MAX_FILES)
-    return False
+        return ".glb"
+    if magic.startswith(_ZIP_MAGIC):
+        check_zip(file, MAX_FILES)
+        return _ZIP
+    suffix = PurePath(name).suffix.lower()
+    if suffix == ".glb" or not any(suffix in suffixes for suffixes in _RANKS):
+        raise CorruptFile(file, f"it is no mesh that can be read; send {_EXPECTED}")
+    return suffix
 
 
-def unpack_mesh(file: Path, out: Path) -> Path:
+def unpack_mesh(file: Path, out: Path, name: str) -> Path:
     """Unpack the mesh of an upload, with the files that it names beside it.
 
     Args:
-        file: a GLB or a zip, whatever it is called.
+        file: one mesh, or a zip.
         out: folder to write; must not exist.
+        name: what its owner calls it.
 
     Returns:
         The mesh in `out`.
@@ -73,9 +81,10 @@ def unpack_mesh(file: Path, out: Path) -> Path:
         CorruptFile: if it is neither, or the zip holds no mesh or several, is damaged, a bomb, or leads elsewhere.
         CannotWrite: if the disk is full.
     """
-    if check_upload(file):
+    suffix = check_upload(file, name)
+    if suffix != _ZIP:
         out.mkdir()
-        return shutil.copyfile(file, out / _GLB_NAME)
+        return shutil.copyfile(file, out / f"the uploaded mesh{suffix}")  # as messages call it
     paths = [p for p in check_zip(file, MAX_FILES) if p.name[:1] != "." and p.parts[0] != "__MACOSX"]
     ranked = ([p for p in paths if p.suffix.lower() in suffixes] for suffixes in _RANKS)
     meshes = next(filter(None, ranked), [])
@@ -315,7 +324,7 @@ def read_mesh(path: Path, scale: float = 1.0, unpacked: Path | None = None) -> T
     if suffix == ".zip":
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "unpacked"
-            return read_mesh(unpack_mesh(path, out), scale, out)
+            return read_mesh(unpack_mesh(path, out, path.name), scale, out)
     files = NamedFiles(path, unpacked)
     try:
         surfaces = [s for s in _surfaces(path, files) if len(s.faces)]

@@ -18,7 +18,7 @@ const scale = () => Number(form().elements.unit.value);
 const bareName = (name) => name.replace(/\.[^.]*$/, "").replace(/[_-]+/g, " ").trim();
 
 /** Whether a file is meant to be an object. */
-export const isMesh = (file) => /\.(glb|zip|obj|gltf|ply|stl)$/i.test(file.name);
+export const isMesh = (file) => /\.(glb|zip|obj|gltf|ply|stl|off)$/i.test(file.name);
 
 function tell(text, isError = false) {
   byId("own-object-error").hidden = !isError;
@@ -72,7 +72,7 @@ function nameFrom(label) {
 }
 
 async function send() {
-  if (!chosen) throw new Error("Choose a file first: a GLB, or a zip of an OBJ with its MTL and texture.");
+  if (!chosen) throw new Error("Choose a file first: a GLB, PLY or STL, or a zip of an OBJ with its MTL and texture.");
   const { label, grams } = form().elements;
   const query = new URLSearchParams({
     name: nameFrom(label.value), label: label.value.trim(), scale: scale(), file_name: chosen.name.slice(-200),
@@ -82,7 +82,8 @@ async function send() {
   bar.hidden = false;
   bar.value = 0;
   tell(`Sending ${chosen.name}`);
-  const type = /\.zip$/i.test(chosen.name) ? "application/zip" : "model/gltf-binary";
+  const types = { zip: "application/zip", glb: "model/gltf-binary" };
+  const type = types[chosen.name.split(".").at(-1).toLowerCase()] ?? "application/octet-stream";
   try {
     showJob(await upload(`objects?${query}`, chosen, (share) => { bar.value = share; }, type));
     scrollTo(byId("object-work")); // where the work is told, and then the next step

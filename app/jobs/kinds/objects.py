@@ -81,7 +81,7 @@ def _added(new: NewObject, file_name: str, place: JobContext) -> Iterator[Adding
 
     inputs = place.folder / INPUTS
     yield AddingStep(0, _STEPS, "Unpacking the mesh", new.name)
-    mesh_file = unpack_mesh(inputs / UPLOAD, inputs / "unpacked")
+    mesh_file = unpack_mesh(inputs / UPLOAD, inputs / "unpacked", file_name)
     yield AddingStep(1, _STEPS, "Reading mesh and texture", new.name)
     mesh = read_mesh(mesh_file, new.scale, inputs / "unpacked")
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)

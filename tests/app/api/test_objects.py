@@ -167,6 +167,16 @@ def test_a_zipped_obj_in_millimetres_keeps_the_texture_that_lies_in_another_fold
     own.delete("/api/objects/red")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["PLY", "stl"])
+def test_a_bare_file_of_another_format_is_known_by_the_end_of_its_name(own, ending):
+    content = textured_box().export(file_type=ending.lower())
+    job = added(own, content, "application/octet-stream", name="bare", file_name=f"scan.{ending}")
+    assert job["state"] == "done", job["error"]
+    assert job["result"]["size_m"] == pytest.approx(OBJ_SIDES_M, abs=1e-5)
+    own.delete("/api/objects/bare")
+
+
 def views(client, name):
     png = client.get(f"/api/objects/{name}/thumbnail.png")
     assert png.status_code == 200, png.text
@@ -216,6 +226,7 @@ def test_what_is_no_mesh_is_refused_at_once(own):
         answer = send(own, content)
         is_problem(answer, 422)
         assert answer.json()["detail"].startswith("The uploaded file")
+    is_problem(send(own, b"hello", file_name="photo.jpg"), 422)
 
 
 @pytest.mark.slow
