@@ -54,7 +54,7 @@ def models(fields):
 
 
 def at(pose, name=NAME, iou=0.95):
-    return PhotoObject(name, PhotoPose(pose, 0.1, iou, 0.1, 0.9), (), "", 0.0, 0.0)
+    return PhotoObject(name, PhotoPose(pose, 0.1, iou, 0.1, 0.9, 0.8), (), "", 0.0, 0.0)
 
 
 def found_in(models, photo, name, config=None):
