@@ -636,13 +636,13 @@ def _half(surfels: Surfels) -> np.float32:
 
 _PATCH_PX, _STEP_PX, _REACH_PX = 28, 14, 5
 _BAND_PX = 1.2, 7.0  # standard deviations, between which details count
-_FILLED = 0.6  # of a patch that must show the object
+_FILLED, _FEWEST_PATCHES = 0.6, 8  # share of a patch that must show the object; fewer patches agree by chance
 _RIM = np.ones((5, 5), np.uint8)
 
 
 def print_match(loss: PoseLoss, pose: Pose) -> float:
-    """Return m of one pose over all windows, 0 without any patch; 1 where the print is found in all of them."""
-    found = weights = 0.0
+    """Return m of one pose over all windows: 1 where all of its print is found, 0 where too little of it is seen."""
+    found, weights, count = 0.0, 0.0, 0
     for window in loss.windows:
         index = draw(loss.surfels, window, pose[None])[0][0]
         shown = index >= 0
@@ -662,8 +662,8 @@ def print_match(loss: PoseLoss, pose: Pose) -> float:
             if weight > 0:
                 alike = cv2.matchTemplate(around, template, cv2.TM_CCORR_NORMED, mask=inside[patch])
                 found += weight * float(np.nan_to_num(alike, posinf=0.0, neginf=0.0).max())
-                weights += weight
-    return found / weights if weights else 0.0
+                weights, count = weights + weight, count + 1
+    return found / weights if count >= _FEWEST_PATCHES else 0.0
 
 
 def _details(image: np.ndarray, mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
