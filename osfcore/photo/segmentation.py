@@ -27,7 +27,7 @@ _CORE, _SURE_CORE = 0.8, 0.6  # axes, per side of the box, of ellipses in it: pr
 _FORCED = 0.02  # by which the misfit of what begins from the second must be less: it holds what may be no object
 _CENTRAL = 0.2  # of the sides: clicks within this distance of the middle do not say that something else is in it
 _MOST_MISFIT = 0.3  # above, an outline is doubtful; boxes drawn with usual care have 0.05 to 0.25
-_SHARED = 0.03  # more misfit of the one than of the other without what both outlines hold: it is the one's
+_BEHIND, _FRONT = 0.04, 0.1  # misfit gained without what two outlines share: at most, if it is the other's; at least
 _ITERATIONS = 3
 _OUTLINE_SIGMA = 0.7  # over which the outline is smoothed [px of the reduced picture]
 _WHAT = "box of the object [px]"
@@ -82,8 +82,8 @@ def propose_mask(
 def propose_masks(image: Picture, boxes: Mapping[str, Box], clicks: Mapping[str, Points]) -> dict[str, Mask]:
     """Find the masks of several objects: clicks on one are background for the others.
 
-    What two outlines both hold is that object's whose extent fits its box clearly worse without it: what lies in
-    front of another object is seen whole.
+    What two outlines both hold is that object's whose extent fits its box clearly worse without it, if the other's
+    does not: what lies in front of another object is seen whole.
 
     Args:
         image: encoded RGB, as people see it.
@@ -103,7 +103,7 @@ def propose_masks(image: Picture, boxes: Mapping[str, Box], clicks: Mapping[str,
         if both.any():
             lacks = {n: _misfit(masks[n] & ~both, inside[n]) - _misfit(masks[n], inside[n]) for n in pair}
             behind, front = sorted(pair, key=lacks.__getitem__)
-            if lacks[front] > lacks[behind] + _SHARED:
+            if lacks[behind] < _BEHIND and lacks[front] > _FRONT:
                 masks[behind] = masks[behind] & ~both
     return masks
 
