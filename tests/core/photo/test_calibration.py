@@ -26,7 +26,7 @@ from osfcore.photo.calibration import (
 )
 from osfcore.photo.read_photograph import RawPhotograph
 from osfcore.photo.summary import locate, locate_calibrated
-from tests.support.boards import RADIAL, SIZE, VARIED, K, on_table, project, sighting, sightings
+from tests.support.boards import RADIAL, SIZE, VARIED, K, on_table, project, sighting, sightings, tilted
 from tests.support.errors import about
 
 # camera.json: what is written is read, and photographs of any size are taken as the calibrated camera's.
