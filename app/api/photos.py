@@ -26,10 +26,13 @@ from app.jobs.params import Identifier, Seed
 from app.processes.messages.photo_messages import CameraSource, Mark, Points, Stroke
 from app.storage.records import MarkedObject, TablePhoto
 from osfcore.geometry.workspace import TABLE_SIDE_M
-from osfcore.photo.board import Board, board_pdf
+from osfcore.photo.board import BOARD_FORM, Board, board_of, board_pdf
 from osfcore.photo.calibration import MOST_PHOTOS, CalibrationJson, board_place, calibration_to_json
 from osfcore.photo.camera_files import known_camera
 from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, TableSource
+
+BoardText = Annotated[str, Field(max_length=100)]
+_BOARD = f"Board that may be in view: {BOARD_FORM}; empty for the one to print."
 
 
 class CameraIn(Excerpt):
@@ -121,6 +124,7 @@ class PhotoPatch(Input):
 
     focal_px: Focal | None
     camera: CameraIn | None = Field(None, description="`camera` of a calibration.")
+    board: BoardText | None = Field(None, description=f"{_BOARD} Null for the one that was told before.")
 
 
 class FindIn(Input):
@@ -178,6 +182,7 @@ class MarkedOut(BaseModel):
     off: list[list[float]]
     strokes: list[StrokeIn]
     outline: list[list[list[float]]] = Field(description="Closed polygons around its mask and around holes in it.")
+    doubt: str = Field(description="A sentence if the outline does not fill its box; empty if it does.")
     choice: int | None = Field(description="The pose that a person took; null before that.")
     found: ObjectFound | None
 
@@ -192,7 +197,8 @@ class PhotoFacts(BaseModel):
     height: int = Field(description="[px]")
     focal_px: float = Field(description="In pixels of the photo as it was sent.")
     focal_source: CameraSource = Field(description="The board, the user, the file, how objects stand, or nothing.")
-    on_board: bool = Field(description="Whether the printed board is in view.")
+    on_board: bool = Field(description="Whether the board is in view.")
+    board: str = Field(description="That was looked for, in words; empty for the one to print.")
 
 
 class TablePhotoOut(PhotoFacts):
@@ -244,6 +250,7 @@ def _facts(photo: TablePhoto) -> PhotoFacts:
         focal_px=round(float(photo.K[0, 0]) * photo.sent_width / photo.width, 2),
         focal_source=photo.source,
         on_board=photo.T_world_camera is not None,
+        board=photo.board,
     )
 
 
@@ -261,7 +268,8 @@ def _marked(marked: MarkedObject, label: str, found: ObjectFound | None) -> Mark
     strokes = [StrokeIn(adds=s.adds, radius=s.radius, points=_lists(s.points)) for s in mark.strokes]
     return MarkedOut(
         name=marked.name, label=label, box=list(mark.box), on=_lists(mark.on), off=_lists(mark.off),
-        strokes=strokes, outline=[_lists(line) for line in marked.outline], choice=marked.choice, found=found,
+        strokes=strokes, outline=[_lists(line) for line in marked.outline], doubt=marked.doubt, choice=marked.choice,
+        found=found,
     )  # fmt: skip
 
 
@@ -315,10 +323,11 @@ async def create(
     focal_px: Annotated[
         float | None, Query(ge=1, le=100_000, description="Focal length in pixels, if it is known.")
     ] = None,
+    board: Annotated[BoardText, Query(description=_BOARD)] = "",
 ) -> TablePhotoOut:
     """Keep a photo of a table, of any size and usual format; its camera is found if the printed board is in view."""
     data = await _photo_body(request, services.settings.max_photo_bytes)
-    photo = await run_in_threadpool(services.photos.receive, data, name, focal_px)
+    photo = await run_in_threadpool(services.photos.receive, data, name, focal_px, board)
     response.headers["Location"] = f"{UPLOAD_PATH}/{photo.id}"
     return _out(services, photo)
 
@@ -355,9 +364,9 @@ def get(services: ServicesDep, photo: PhotoDep) -> TablePhotoOut:
 @router.patch("/{photo}", responses=problems(404, 409, 503, 507))
 @slow
 def set_camera(services: ServicesDep, photo: PhotoDep, body: PhotoPatch) -> TablePhotoOut:
-    """Give a photo another focal length, or the calibrated camera that took it."""
+    """Give a photo another focal length, the calibrated camera that took it, or another board."""
     camera = None if body.camera is None else known_camera(body.camera.model_dump())
-    return _out(services, services.photos.set_camera(photo.id, body.focal_px, camera))
+    return _out(services, services.photos.set_camera(photo.id, body.focal_px, camera, body.board))
 
 
 @router.delete("/{photo}", status_code=204, responses=problems(404, 507))
@@ -469,11 +478,15 @@ calibration_router = APIRouter(
 
 @calibration_router.post("/photos", responses=problems(415, 503), openapi_extra=_PHOTO_BODY)
 async def sight(
-    services: ServicesDep, request: Request, name: Annotated[DisplayName, Query(description="For people.")] = "Photo"
+    services: ServicesDep,
+    request: Request,
+    name: Annotated[DisplayName, Query(description="For people.")] = "Photo",
+    board: Annotated[BoardText, Query(description=_BOARD)] = "",
 ) -> SightingOut:
-    """Look for the printed board in a photo; the photo itself is not kept."""
+    """Look for the board in a photo; the photo itself is not kept."""
+    described = board_of(board)
     data = await _photo_body(request, services.settings.max_photo_bytes)
-    identifier, seen = await run_in_threadpool(services.board_photos.add, data, name)
+    identifier, seen = await run_in_threadpool(services.board_photos.add, data, name, described)
     width, height = seen.size
     corners = seen.points_px.round(2).tolist()
     return SightingOut(id=identifier, name=seen.name, width=width, height=height, corners=corners)

@@ -16,10 +16,10 @@ from osfcore.errors import InvalidInput, UnknownName, shown
 from osfcore.io.files import write_atomically, write_json, writing
 from osfcore.io.json_codec import encode
 from osfcore.photo import calibration
-from osfcore.photo.board import Board, board_pdf
+from osfcore.photo.board import Board, board_of, board_pdf
 from osfcore.photo.camera_files import read_camera
 from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
-from osfcore.photo.segmentation import Box, propose_mask
+from osfcore.photo.segmentation import Box, outline_doubt, propose_masks
 from osfcore.random_streams import Stream, stream_rng
 
 if TYPE_CHECKING:
@@ -58,13 +58,16 @@ class PhotoCalibrate(Command):
     """Photo of the board lying on the table, by the camera in the place where it stays; gives that place."""
     place: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Where the board's centre lies then: x and y in metres, and by how many degrees it is turned to the left."""
+    board: str = ""
+    """Another board than that of 'osf photo board', such as 5x7,0.04,0.03,DICT_5X5_100: squares, sides in metres."""
 
     def run(self) -> dict[str, Any]:
         """Calibrate; the result is what the file holds."""
         check_out(self.out, ".json")
         place = calibration.board_place(*self.place)
-        views = [calibration.sight(read_photograph(path), path.name) for path in self.photo]
-        table = None if self.table is None else calibration.sight(read_photograph(self.table), self.table.name)
+        board = board_of(self.board)
+        views = [calibration.sight(read_photograph(path), path.name, board) for path in self.photo]
+        table = None if self.table is None else calibration.sight(read_photograph(self.table), self.table.name, board)
         found = calibration.calibrated_camera(views, table, place)
         result = calibration.calibration_to_json(found, self.out.stem)
         write_json(self.out, result)
@@ -113,6 +116,8 @@ class PhotoEstimate(DataCommand):
     """Focal length in pixels; by default that of the board or the camera."""
     camera: Path | None = None
     """The camera that took the photos, from 'osf photo calibrate', ROS, OpenCV, Kalibr or RealSense, or K as .txt."""
+    board: str = ""
+    """Another board than that of 'osf photo board', such as 5x7,0.04,0.03,DICT_5X5_100: squares, sides in metres."""
     images: Path | None = None
     """Folder for a picture of each object: photo, outlines of mask and object, the object as found."""
     seed: int = 0
@@ -130,7 +135,7 @@ class PhotoEstimate(DataCommand):
         config = PhotoConfig(starts, focal_known=focal_known)
         last = last_of(estimate_photo(models, photos, names, rng, config))
         photos = tuple(map(last.as_seen, photos))
-        result = encode(summarised(photos, last, models, notes))
+        result = encode(summarised(photos, last, models, notes, board_of(self.board)))
         write_json(self.out, result)
         if self.images is not None:
             _write_sheets(self.images, models, photos, last)
@@ -155,6 +160,7 @@ class PhotoEstimate(DataCommand):
 
         self._check_counts()
         camera = None if self.camera is None else read_camera(self.camera)
+        board = board_of(self.board)
         raws = [read_photograph(path) for path in self.photo]
         boxes: list[dict[str, Box]] = [{} for _ in raws]
         for text in self.boxes:
@@ -166,9 +172,13 @@ class PhotoEstimate(DataCommand):
         image, marked = self.image_id[0] if self.image_id else None, tuple({name for its in masks for name in its})
         choice = PoseChoice(image, self.scene_id, self.pose_source, self.pose_frame, marked)
         poses = {} if self.poses is None else read_poses(self.poses, choice)
-        photos, notes, focal_known = [], [], True
+        outlines = zip(boxes, masks, strict=True)
+        doubts = [outline_doubt(n, box, found[n]) for its, found in outlines for n, box in its.items()]
+        photos, notes, focal_known = [], [doubt for doubt in doubts if doubt], True
+        if notes:  # the search takes long
+            self.say(*notes)
         for path, raw, its in zip(self.photo, raws, masks, strict=True):
-            found = locate(raw, self.focal) if camera is None else locate_calibrated(raw, camera)
+            found = locate(raw, self.focal, board) if camera is None else locate_calibrated(raw, camera, board)
             if found.T_world_camera is None and len(raws) > 1:
                 allowed = f"to be seen, since there are several photos ({found.missing.rstrip('.')})"
                 raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed)
@@ -201,7 +211,7 @@ class PhotoEstimate(DataCommand):
     def _masks(
         self, known: Collection[str], raw: RawPhotograph, boxes: Mapping[str, Box], number: int
     ) -> dict[str, Any]:
-        """Masks of one photo: from its folder, and where there is a box from that and a click in its middle."""
+        """Masks of one photo: from its folder, and where there are boxes from those and clicks in their middles."""
         from osfcore.contrib.bop import read_masks
 
         masks: dict[str, Any] = {}
@@ -209,10 +219,8 @@ class PhotoEstimate(DataCommand):
             height, width = raw.encoded.shape[:2]
             image = self.image_id[number] if self.image_id else None
             masks |= read_masks(self.masks[number], known, (raw.sent_size, (width, height)), image)
-        for name, (left, top, right, bottom) in boxes.items():
-            middle = np.array([[(left + right) / 2, (top + bottom) / 2]])
-            masks[name] = propose_mask(raw.eight_bit, (left, top, right, bottom), middle)
-        return masks
+        middles = {name: np.reshape(box, (2, 2)).mean(axis=0)[None] for name, box in boxes.items()}
+        return masks | propose_masks(raw.eight_bit, boxes, middles)
 
 
 def _box(text: str, paths: Sequence[Path], raws: Sequence[RawPhotograph]) -> tuple[int, str, Box]:

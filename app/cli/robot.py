@@ -127,8 +127,11 @@ class RobotDriveCommand(DataCommand):
                 return allowed
 
             drive = opened.enter_context(contextlib.closing(RobotDrive(order, permit)))
-            progress, said = EpisodeProgress(0, self.steps, ""), ""
+            progress, said, doubts = EpisodeProgress(0, self.steps, ""), "", 0
             for event in drive.run():
+                for doubt in drive.doubts[doubts:]:
+                    self.say(doubt)
+                doubts = len(drive.doubts)
                 progress = progress.after(event)
                 note = progress.note.partition(": ")[0]  # what follows counts up
                 if note != said:
@@ -186,8 +189,6 @@ def _asked(drive: RobotDrive, url: str) -> bool:
     print(
         f"It stays within x {x0:g} to {x1:g}, y {y0:g} to {y1:g} m, no faster than {drive.limits.top_speed_m_s:g} m/s."
     )
-    for doubt in drive.doubts:
-        print(doubt)
     try:
         return input(f"Move the robot at {url}? [y/N] ").strip().lower() in ("y", "yes")
     except EOFError:

@@ -68,7 +68,7 @@ class DriveOrder:
 class RobotDrive:
     """An episode with a robot. Whoever runs it closes it, which stops the robot.
 
-    `limits` are those that hold, `doubts` sentences that a person should read before the robot moves.
+    `limits` are those that hold.
 
     Args:
         order: what is wanted.
@@ -91,12 +91,17 @@ class RobotDrive:
             goal = read_goal_photo(order, robot.description.cameras)
             models = load_scene_models(order.names, fields, assets, order.data_dir, order.device)
             opened.pop_all()
-        self.doubts = doubts_about(robot.description)
+        self._doubts = doubts_about(robot.description)
         self._guard = GuardedWorld(robot, self.limits, permit)
-        world, rng = OutlinedWorld(self._guard, order.boxes), stream_rng(order.seed, Stream.EPISODE)
-        self._episode = Episode(world, models, goal, order.settings, rng)
+        self._world, rng = OutlinedWorld(self._guard, order.boxes), stream_rng(order.seed, Stream.EPISODE)
+        self._episode = Episode(self._world, models, goal, order.settings, rng)
         about = About(order.names, order.seed, order.settings, robot=lambda: self._told(order.url))
         self._record = EpisodeRecord(order.out, None, about)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Sentences that a person should read before the robot moves; more once the first pictures were seen."""
+        return self._doubts + self._world.doubts
 
     def stop(self, reason: str) -> None:
         """Stop the robot for good; from any thread."""

@@ -61,7 +61,7 @@ def carry_out(order: PhotoOrder) -> PhotoAnswer:
             case ReadPhoto():
                 return _read(order, read_photograph(order.data))
             case SightBoard():
-                return sight(read_photograph(order.data), order.name)
+                return sight(read_photograph(order.data), order.name, order.board)
             case AssessCamera():
                 return assess(order.views, order.table, order.T_world_board)
             case FindMask():
@@ -73,7 +73,8 @@ def carry_out(order: PhotoOrder) -> PhotoAnswer:
 def _read(order: ReadPhoto, raw: RawPhotograph) -> PhotoRead:
     from osfcore.photo.summary import locate, locate_calibrated
 
-    found = locate(raw, order.focal_px) if order.camera is None else locate_calibrated(raw, order.camera)
+    camera, board = order.camera, order.board
+    found = locate(raw, order.focal_px, board) if camera is None else locate_calibrated(raw, camera, board)
     height, width = found.raw.encoded.shape[:2]
     return PhotoRead(
         _encoded(".jpg", found.raw.eight_bit, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]),
@@ -95,7 +96,7 @@ def _encoded(kind: str, picture: np.ndarray, options: list[int] | None = None) -
 
 
 def _mask(order: FindMask) -> MaskFound:
-    from osfcore.photo.segmentation import propose_mask
+    from osfcore.photo.segmentation import outline_doubt, propose_mask
 
     picture, mark = cv2.imdecode(np.frombuffer(order.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB), order.mark
     assert picture is not None
@@ -105,7 +106,8 @@ def _mask(order: FindMask) -> MaskFound:
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     plain = [cv2.approxPolyDP(line, _OUTLINE_PX, True)[:, 0] + 0.5 for line in outlines]
     polygons = tuple(tuple((float(x), float(y)) for x, y in line) for line in plain if len(line) > 2)
-    return MaskFound(encode_png(np.where(mask, 255, 0).astype(np.uint8)), polygons)
+    doubt = "" if mark.strokes else outline_doubt("the object", mark.box, mask)  # what is painted was judged by eye
+    return MaskFound(encode_png(np.where(mask, 255, 0).astype(np.uint8)), polygons, doubt)
 
 
 def _painted(mark: Mark, shape: tuple[int, int]) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:

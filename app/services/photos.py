@@ -52,6 +52,7 @@ from osfcore.geometry.states import MAX_OBJECTS, SceneState
 from osfcore.io.files import read_json
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import decode
+from osfcore.photo.board import Board, board_of
 from osfcore.photo.calibration import Calibration, Sighting
 from osfcore.photo.camera_files import KnownCamera
 from osfcore.photo.found_scene import FoundScene
@@ -106,38 +107,48 @@ class TablePhotos(TablePhotoStore):
 
     # Photographs
 
-    def receive(self, data: bytes, name: str, focal_px: float | None = None) -> TablePhoto:
+    def receive(self, data: bytes, name: str, focal_px: float | None = None, board: str = "") -> TablePhoto:
         """Keep a photograph.
 
         Args:
             data: a picture in any usual format.
             name: for people.
             focal_px: focal length in pixels of the photo; None where nobody knows.
+            board: that may be in view, as `board_of` reads it.
 
         Raises:
             PhotoRefused: if it cannot be used.
-            InvalidInput: if the focal length makes no sense.
+            InvalidInput: if the focal length or the board makes no sense.
             ProcessUnavailable: if what decodes it died.
             TooManyPhotos: if there are too many.
             StorageFull, CannotStore: if nothing more may be written, or the disk is full.
         """
-        read = self._look(data, focal_px)
+        read = self._look(data, focal_px, None, board)
         self._runner.storage.check_room()
         facts = uuid.uuid4().hex[:12], name, now_utc(), read.width, read.height, read.sent_width
-        photo = TablePhoto(*facts, np.array(read.K), read.source, read.T_world_camera, read.notes)
+        photo = TablePhoto(*facts, np.array(read.K), read.source, read.T_world_camera, read.notes, board=board)
         self.keep(photo, data, read.jpeg, read.straight)
         self._runner.hub.publish(PhotosChanged())
         return photo
 
-    def set_camera(self, photo: str, focal_px: float | None, camera: KnownCamera | None = None) -> TablePhoto:
+    def set_camera(
+        self, photo: str, focal_px: float | None, camera: KnownCamera | None = None, board: str | None = None
+    ) -> TablePhoto:
         """Look at a photograph with another focal length, in pixels of the photo as it was sent, or calibrated camera.
+
+        Args:
+            photo: identifier.
+            focal_px: focal length; None for what board or file give.
+            camera: that took it; the focal length does not count then.
+            board: that may be in view, as `board_of` reads it; None for the one that was told before.
 
         Raises:
             UnknownName: if there is none.
-            InvalidInput: if the focal length makes no sense, or the camera took photographs of another shape.
+            InvalidInput: if focal length or board make no sense, or the camera took photographs of another shape.
         """
-        read = self._look(self.read(self.sent(photo), photo), focal_px, camera)
-        facts = {"K": np.array(read.K), "source": read.source, "T_world_camera": read.T_world_camera}
+        board = self.get(photo).board if board is None else board
+        read = self._look(self.read(self.sent(photo), photo), focal_px, camera, board)
+        facts = {"board": board, "K": np.array(read.K), "source": read.source, "T_world_camera": read.T_world_camera}
         files = {PICTURE: read.jpeg, STRAIGHT: read.straight}
         return self._outdated(photo, lambda latest: replace(latest, **facts, notes=read.notes), files)
 
@@ -171,7 +182,7 @@ class TablePhotos(TablePhotoStore):
         asked = replace(mark, off=(*mark.off, *others))  # what is another object is not this one
         found = self.looker.ask(FindMask(self.read(self.picture(photo), photo), asked))
         assert isinstance(found, MaskFound)
-        entry = MarkedObject(name, mark, found.outline)
+        entry = MarkedObject(name, mark, found.outline, doubt=found.doubt)
         return self._outdated(photo, lambda latest: latest.with_object(entry), {mask_file(name): found.png})
 
     def unmark(self, photo: str, name: str) -> TablePhoto:
@@ -217,7 +228,7 @@ class TablePhotos(TablePhotoStore):
         self._end_search(first)
         params = PhotoParams(
             photo=first.id, title=first.name, names=names, seed=seed, notes=first.notes,
-            photos=tuple(map(_order, photos)),
+            board=first.board, photos=tuple(map(_order, photos)),
         )  # fmt: skip
         with self._runner.jobs.new_inputs() as folder:
             fill_inputs(folder, self._inputs(photos))
@@ -318,8 +329,8 @@ class TablePhotos(TablePhotoStore):
             files |= inputs_of(number, straight if straight.is_file() else self.sent(photo.id), masks)
         return files
 
-    def _look(self, data: bytes, focal_px: float | None, camera: KnownCamera | None = None) -> PhotoRead:
-        read = self.looker.ask(ReadPhoto(data, focal_px, camera))
+    def _look(self, data: bytes, focal_px: float | None, camera: KnownCamera | None, board: str) -> PhotoRead:
+        read = self.looker.ask(ReadPhoto(data, focal_px, camera, board_of(board)))
         assert isinstance(read, PhotoRead)
         return read
 
@@ -533,14 +544,14 @@ class BoardPhotos:
         self._lock = threading.Lock()
         self._sightings: dict[str, Sighting] = {}
 
-    def add(self, data: bytes, name: str) -> tuple[str, Sighting]:
-        """Look for the board in a photograph; an identifier, and where it is.
+    def add(self, data: bytes, name: str, board: Board) -> tuple[str, Sighting]:
+        """Look for a board in a photograph; an identifier, and where it is.
 
         Raises:
             PhotoRefused: if it cannot be used, or shows no board.
             ProcessUnavailable: if what decodes it died.
         """
-        sighting = self._ask(SightBoard(data, name))
+        sighting = self._ask(SightBoard(data, name, board))
         assert isinstance(sighting, Sighting)
         identifier = uuid.uuid4().hex[:12]
         with self._lock:

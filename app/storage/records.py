@@ -403,12 +403,14 @@ class MarkedObject:
         mark: how.
         outline: of its mask.
         choice: which of the poses that were found a person took, the best being 0; None before that.
+        doubt: a sentence if the mask does not fill the box; "" if it does.
     """
 
     name: str
     mark: Mark
     outline: tuple[Points, ...]
     choice: int | None = None
+    doubt: str = ""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -431,6 +433,7 @@ class TablePhoto:
         scene: the table that it became; None if it did not.
         T_table_photo: where the photograph's table frame lies on that table.
         number: orders the photographs; the store gives it.
+        board: that was looked for, as `board_of` reads it; "" for the one to print.
     """
 
     id: Text
@@ -448,6 +451,7 @@ class TablePhoto:
     scene: Text | None = None
     T_table_photo: _PoseFact | None = None
     number: int = 0
+    board: Text = ""
 
     def marked(self, name: str) -> MarkedObject:
         """Return one of the marked objects.

@@ -40,7 +40,7 @@ from osfcore.photo.lamp import ShadedPixels, fit_lamp
 from osfcore.photo.photograph import Photograph
 from osfcore.photo.pose_loss import LossKind, object_windows
 from osfcore.photo.poses import PhotoConfig, PhotoModels, PhotoObject, estimate_photo, table_from_points
-from osfcore.photo.segmentation import Box, propose_masks
+from osfcore.photo.segmentation import Box, outline_doubt, propose_masks
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.render.renderer import SceneRenderer
 from osfcore.render.types import SceneBatch
@@ -213,6 +213,7 @@ class PhotoScore:
         coarse_s: of the search over rotations.
         refine_s: of the refinement.
         mask_iou: of the mask that was searched with and the given one.
+        fills_box: whether the mask that was searched with fills the box around the given one.
     """
 
     scene: str
@@ -227,6 +228,7 @@ class PhotoScore:
     coarse_s: float
     refine_s: float
     mask_iou: float = 1.0
+    fills_box: bool = True
 
     @property
     def is_turned_right(self) -> bool:
@@ -261,6 +263,7 @@ def photo_report(
         "iou_min": min((s.iou for s in scores), default=None),
         "mask_iou_median": quantile([s.mask_iou for s in scores], 0.5),
         "mask_iou_min": min((s.mask_iou for s in scores), default=None),
+        "boxes_unfilled": sum(not s.fills_box for s in scores),
         "depth_within_10mm": mean(d <= _DEPTH_MM for d in depths),
         "depth_mm_median": quantile(depths, 0.5),
         "frac_15mm_10deg": mean(s.is_right for s in scores if s.is_true),
@@ -421,7 +424,9 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ev
             moved = replace(found, best=replace(found.best, pose=photo.T_world_camera.inverse() @ found.best.pose))
             write_sheet(config.folder / f"{scene.name}-{found.name}-{number}.png", models, scene.photo, moved)
             used, given = photo.masks[found.name], scene.photo.masks[found.name]
-            scores.append(_score(renderer, scene, moved, float((used & given).sum() / (used | given).sum())))
+            mask_iou = float((used & given).sum() / (used | given).sum())
+            fills_box = not outline_doubt(found.name, box_and_click(given)[0], used)
+            scores.append(replace(_score(renderer, scene, moved), mask_iou=mask_iou, fills_box=fills_box))
     lamp_errors = {subject.name: lamp_errors_deg(subject) for path in lamps for subject in read_lamps(path)}
     report = photo_report(scores, lamp_errors, without)
     write_json(config.folder / "report.json", report)
@@ -449,7 +454,7 @@ def _names(config: EvaluatePhotos, scene: PhotoFolder, known: set[str]) -> list[
     return [n for n in scene.photo.masks if n in known and (config.start == NONE or n in scene.poses.get(source, {}))]
 
 
-def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject, mask_iou: float) -> PhotoScore:
+def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject) -> PhotoScore:
     """Compare an object, its pose in the camera's frame, with mask, depth and reference pose."""
     name, pose = found.name, found.best.pose
     iou, depth_mm = _fit(renderer, scene, name, pose)
@@ -469,7 +474,6 @@ def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject, mask
         ratio=min(ratio, 99.0),
         coarse_s=found.coarse_s,
         refine_s=found.refine_s,
-        mask_iou=mask_iou,
     )
 
 

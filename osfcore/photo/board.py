@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from scipy.optimize import least_squares
 
-from osfcore.errors import InvalidInput, UnknownName
+from osfcore.errors import InvalidInput, UnknownName, check_ranges
 from osfcore.geometry.poses import Pose, quaternion_from_matrix
 from osfcore.photo.lens import Lens
 
@@ -389,6 +390,7 @@ def fit_focal(points_m: Points, points_px: Points, size: tuple[int, int], accura
 PAGE_M = (0.297, 0.21)  # A4, landscape
 SQUARE_PIXELS = 384  # of a square of the board, when drawn
 _MIN_MARGIN_M = 0.008
+_MOST_SQUARES, _SQUARE_RANGE_M = 20, (0.002, 1.0)
 _MIN_CORNERS = 6
 _GUESS_PX = 2.0  # by which corners of markers may be off
 _PLACE_PX = 3.0  # from where a marker should be
@@ -403,10 +405,10 @@ _MAX_BLUR_PX = 1.6  # sharp photographs have 0.6 to 1.3, and markers of 15 px ar
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A ChArUco board: a chessboard with markers in its white squares, on a landscape A4 page.
+    """A ChArUco board: a chessboard with markers in its white squares.
 
-    The default was chosen by measurement: with smaller squares, or markers of 5 x 5 bits, the board is lost more often
-    in 640 x 480 pixels from 1 m and 25 degrees above the table.
+    The default, which is printed on a landscape A4 page, was chosen by measurement: with smaller squares, or markers of
+    5 x 5 bits, the board is lost more often in 640 x 480 pixels from 1 m and 25 degrees above the table.
 
     Attributes:
         columns: of squares.
@@ -414,6 +416,7 @@ class Board:
         square_m: side of a square [m].
         marker_m: side of a marker with its black border [m].
         dictionary: of the markers, one of OpenCV's.
+        legacy: whether the top left square is white where the number of rows is even, as in OpenCV before 4.6.
     """
 
     columns: int = 6
@@ -421,17 +424,15 @@ class Board:
     square_m: float = 0.044
     marker_m: float = 0.033
     dictionary: str = "DICT_4X4_50"
+    legacy: bool = False
 
     def __post_init__(self) -> None:
-        """Check that the board can be made and fits on the page."""
-        if self.columns < 3 or self.rows < 3:
-            raise InvalidInput("squares of the board", f"{self.columns} x {self.rows}", "at least 3 x 3")
+        """Check that there can be such a board."""
+        if not (3 <= self.columns <= _MOST_SQUARES and 3 <= self.rows <= _MOST_SQUARES):
+            raise InvalidInput("squares of the board", f"{self.columns} x {self.rows}", f"3 to {_MOST_SQUARES} a side")
+        check_ranges(("square_m of the board", self.square_m, *_SQUARE_RANGE_M))
         if not 0.3 * self.square_m <= self.marker_m <= 0.9 * self.square_m:
             raise InvalidInput("marker_m of the board", self.marker_m, "0.3 to 0.9 times square_m")
-        for side, page in zip(self.size_m, PAGE_M, strict=True):
-            if not 0 < side <= page - 2 * _MIN_MARGIN_M:
-                allowed = f"at most {page - 2 * _MIN_MARGIN_M:.3f}, so that it fits on landscape A4 with a margin"
-                raise InvalidInput("side of the board [m]", round(side, 4), allowed)
         known = len(marker_dictionary(self.dictionary).bytesList)
         if self.columns * self.rows // 2 > known:
             raise InvalidInput("squares of the board", f"{self.columns} x {self.rows}", f"at most {2 * known} in all")
@@ -440,6 +441,12 @@ class Board:
     def size_m(self) -> tuple[float, float]:
         """Width and height [m]."""
         return self.columns * self.square_m, self.rows * self.square_m
+
+    @property
+    def sheet_m(self) -> tuple[float, float]:
+        """Width and height that its sheet may hide: landscape A4, or more if the board with a margin needs it [m]."""
+        across, down = (max(side + 2 * _MIN_MARGIN_M, page) for side, page in zip(self.size_m, PAGE_M, strict=True))
+        return across, down
 
     def corners_m(self) -> Points:
         """Return where four squares meet, in the table frame [m]."""
@@ -456,11 +463,39 @@ class Board:
 
     def _charuco(self) -> cv2.aruco.CharucoBoard:
         dictionary = marker_dictionary(self.dictionary)
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, dictionary)
+        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, dictionary)
+        board.setLegacyPattern(self.legacy)
+        return board
 
     def _in_table_frame(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """From OpenCV's frame, whose origin is the board's top left and whose y points down."""
         return (points[..., :2] - np.array(self.size_m) / 2) * (1.0, -1.0)
+
+
+BOARD_FORM = "COLUMNSxROWS,SQUARE,MARKER,DICTIONARY, such as 5x7,0.04,0.03,DICT_5X5_100, with sides in metres"
+
+
+def board_of(text: str) -> Board:
+    """Return the board that a text describes: "5x7,0.04,0.03,DICT_5X5_100", and ",legacy" for the older pattern.
+
+    An empty text stands for the board to print.
+
+    Raises:
+        InvalidInput: if it describes none, or there can be no such board.
+        UnknownName: if there is no such dictionary.
+    """
+    if not text:
+        return Board()
+    squares, *rest = text.replace(" ", "").split(",")
+    try:
+        columns, rows = (int(count) for count in squares.lower().split("x"))
+        square, marker = (float(side) for side in rest[:2])
+        dictionary, *legacy = rest[2:]
+    except ValueError:
+        raise InvalidInput("board", text, f"{BOARD_FORM}; add ,legacy for patterns of OpenCV before 4.6") from None
+    if legacy not in ([], ["legacy"]):
+        raise InvalidInput("end of the board's description", ",".join(legacy), '"legacy" or left out')
+    return Board(columns, rows, square, marker, dictionary, bool(legacy))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -521,7 +556,7 @@ def board_points(image: Image8, board: Board) -> FoundPoints:
         if len(best.points_m) >= _MIN_CORNERS or max(grey.shape) <= side:
             break
     if len(best.points_m) < _MIN_CORNERS:
-        raise _not_found(grey, len(best.points_m))
+        raise _not_found(grey, board, len(best.points_m))
     return best
 
 
@@ -571,8 +606,8 @@ def _board_points(grey: Grey, board: Board) -> FoundPoints:
     pattern = Pattern(board.image().astype(np.float32), board.size_m, board.corners_m(), board.square_m)
     found = find_points(grey, pattern, guess)
     if len(found.points_m) and (_moved(plane, corners[own], found) or _continued(board, corners[~own], found)):
-        has = f"{board.columns} x {board.rows} squares with markers of {board.dictionary}"
-        raise InvalidInput("board in the photograph", "another one", f"the one that was told, which has {has}")
+        seen = print_in(grey)
+        raise _another(board, None if seen is None or seen.is_of(board) else seen)
     return found
 
 
@@ -595,8 +630,24 @@ def _continued(board: Board, corners: Quads, found: FoundPoints) -> bool:
     return bool(continue_it.sum() >= _STRAY_MARKERS)
 
 
-def _not_found(grey: Grey, corners: int) -> InvalidInput:
+def _another(board: Board, seen: SeenPrint | None) -> InvalidInput:
+    """Return the error of a photograph that shows another board than the one that was told."""
+    legacy = " in the legacy pattern" if board.legacy else ""
+    told = f"the one that was told, {board.columns} x {board.rows} squares with markers of {board.dictionary}{legacy}"
+    if seen is None:
+        return InvalidInput("board in the photograph", "another one", f"{told}, or described: {BOARD_FORM}")
+    given = f"another one, {seen.words()}"
+    if not seen.is_charuco:
+        return InvalidInput("board in the photograph", given, f"a ChArUco board, chessboard and markers: {told}")
+    described = f"described as {seen.form()}, with the sides in metres; its markers have {seen.marker:.2f} of a square"
+    return InvalidInput("board in the photograph", given, f"{told}, or {described}")
+
+
+def _not_found(grey: Grey, board: Board, corners: int) -> InvalidInput:
     """Return why a print was probably not found."""
+    seen = print_in(_reduced(grey, _WORKING_SIDES[0]))
+    if seen is not None and not seen.is_of(board):
+        return _another(board, seen)
     if corners:
         allowed = f"at least {_MIN_CORNERS}: show all of it, with nothing lying on it"
         return InvalidInput("number of corners of the board that were found", corners, allowed)
@@ -619,6 +670,131 @@ def _blur_px(grey: Grey) -> float:
     steepest = max(float(np.percentile(np.hypot(*slopes), 99.9)), 1e-3)
     low, high = np.percentile(smooth, (1, 99))
     return float(np.sqrt(max(((high - low) / steepest) ** 2 / (2 * np.pi) - 1, 0)))
+
+
+# Which print of markers a photograph shows, where it is not the board that was told.
+#
+# Markers of every dictionary are looked for. Their numbers run along the rows, so that the number of columns says in
+# which square each marker lies: in every second one of a chessboard, in every one of a grid. Of all numbers of columns
+# that is the right one with which a homography puts most markers upright into the middles of their squares.
+
+
+_DICTIONARIES = (  # the largest of each kind; smaller ones are their beginnings
+    "DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
+    "DICT_APRILTAG_25h9", "DICT_APRILTAG_16h5", "DICT_APRILTAG_36h10", "DICT_ARUCO_MIP_36h12",
+)  # fmt: skip
+_SIZES = (50, 100, 250, 1000)
+_FEWEST_MARKERS = 4
+_PLACED = 0.12  # of a square: by which corners of markers may lie elsewhere
+_LEAST_PLACED = 0.7  # of the markers
+_MARKER_SHARES = (0.25, 0.95)  # of a square's side
+_UNIT = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+_Layout = Literal["charuco", "legacy", "grid", "rising grid"]
+
+
+@dataclass(frozen=True, slots=True)
+class SeenPrint:
+    """A print of markers.
+
+    Attributes:
+        columns: of squares.
+        rows: of squares that were seen.
+        dictionary: the smallest of OpenCV's that holds the markers.
+        layout: markers in every second square, from the second one on ("charuco") or the first ("legacy"); or in all,
+            with rows that follow each other downwards ("grid") or upwards, as Kalibr's.
+        marker: side of a marker in sides of a square.
+    """
+
+    columns: int
+    rows: int
+    dictionary: str
+    layout: _Layout
+    marker: float
+
+    @property
+    def is_charuco(self) -> bool:
+        """Whether it is a chessboard."""
+        return self.layout in ("charuco", "legacy")
+
+    def words(self) -> str:
+        """Return what it is."""
+        if not self.is_charuco:
+            return f"a grid of {self.columns} x {self.rows} markers of {self.dictionary} without a chessboard"
+        legacy = " in the legacy pattern" if self.layout == "legacy" else ""
+        return f"{self.columns} x {self.rows} squares with markers of {self.dictionary}{legacy}"
+
+    def form(self) -> str:
+        """Return how to describe it, but for its size."""
+        return f"{self.columns}x{self.rows},SQUARE,MARKER,{self.dictionary}{',legacy' * (self.layout == 'legacy')}"
+
+    def is_of(self, board: Board) -> bool:
+        """Return whether it may be a part of a board."""
+        is_legacy = board.legacy and board.rows % 2 == 0
+        alike = self.columns == board.columns and self.rows <= board.rows and self.is_charuco
+        same_kind = _kind(self.dictionary) == _kind(board.dictionary)
+        return alike and same_kind and (self.layout == "legacy") == is_legacy
+
+
+def print_in(grey: Grey) -> SeenPrint | None:
+    """Find out which print of markers a photograph shows; None if there are too few that lie in rows."""
+    for name in _DICTIONARIES:
+        best: tuple[int, SeenPrint] | None = None
+        quads, numbers, _ = cv2.aruco.ArucoDetector(marker_dictionary(name)).detectMarkers(grey)
+        if numbers is None or len(numbers) < _FEWEST_MARKERS:
+            continue
+        numbers, corners = np.ravel(numbers), np.reshape(quads, (-1, 4, 2)).astype(float)
+        for layout in get_args(_Layout):
+            for columns in range(2, _MOST_SQUARES + 1):
+                found = _placed(numbers, corners, columns, layout)
+                if found is not None and (best is None or found[0] > best[0]):
+                    count, rows, share = found
+                    best = count, SeenPrint(columns, rows, _smallest(name, int(numbers.max())), layout, share)
+        if best is not None:
+            return best[1]
+    return None
+
+
+def _placed(numbers: np.ndarray, corners: Quads, columns: int, layout: _Layout) -> tuple[int, int, float] | None:
+    """Return how many markers lie where a print has them, its rows, and the markers' side; None if too few do."""
+    squares = _squares(numbers, columns, layout)
+    if np.ptp(squares, axis=0).min() == 0:  # one row or column fits anything
+        return None
+    homography, _ = cv2.findHomography(squares + 0.5, corners.mean(axis=1), cv2.RANSAC, _GUESS_PX * 2)
+    if homography is None or abs(np.linalg.det(homography)) < 1e-12:
+        return None
+    offsets = transform(np.linalg.inv(homography), corners) - (squares + 0.5)[:, None]
+    share = float(np.median(np.abs(offsets))) * 2
+    there = np.all(np.abs(offsets - share * _UNIT) < _PLACED, axis=(1, 2))
+    count = int(there.sum())
+    if count < max(_FEWEST_MARKERS, _LEAST_PLACED * len(numbers)) or not _MARKER_SHARES[0] < share < _MARKER_SHARES[1]:
+        return None
+    rows = int(np.abs(squares[there, 1]).max()) + 1
+    return count, rows + (rows % 2 if layout == "legacy" else 0), share
+
+
+def _squares(numbers: np.ndarray, columns: int, layout: _Layout) -> Float[np.ndarray, "M 2"]:
+    """Return in which square (column, row) of a print each marker lies."""
+    if "grid" in layout:
+        row = numbers // columns * (1 if layout == "grid" else -1)
+        return np.stack([numbers % columns, row], axis=1).astype(float)
+    first = int(layout == "charuco")  # column of the first marker
+    in_first_row = (columns + 1 - first) // 2
+    pair, place = numbers // columns, numbers % columns
+    is_second = place >= in_first_row
+    column = np.where(is_second, 2 * (place - in_first_row) + 1 - first, 2 * place + first)
+    return np.stack([column, 2 * pair + is_second], axis=1).astype(float)
+
+
+def _kind(dictionary: str) -> str:
+    """Return the name of a dictionary without its size: those of one kind begin alike."""
+    head, _, tail = dictionary.rpartition("_")
+    return head if tail.isdigit() else dictionary
+
+
+def _smallest(largest: str, number: int) -> str:
+    """Return the smallest dictionary of a kind that holds a marker."""
+    kind = _kind(largest)
+    return largest if kind == largest else f"{kind}_{next(size for size in _SIZES if number < size)}"
 
 
 # Radial distortion of a lens from one photograph of the board, and photographs without it.
@@ -726,7 +902,14 @@ def page_image(board: Board, pixels_per_m: float) -> Bool[np.ndarray, "h w"]:
     Args:
         board: to print.
         pixels_per_m: resolution; edges are right within half a pixel.
+
+    Raises:
+        InvalidInput: if the board does not fit on the page.
     """
+    for side, page in zip(board.size_m, PAGE_M, strict=True):
+        if side > page - 2 * _MIN_MARGIN_M:
+            allowed = f"at most {page - 2 * _MIN_MARGIN_M:.3f}, so that it fits on landscape A4 with a margin"
+            raise InvalidInput("side of the board [m]", round(side, 4), allowed)
     width, height = (round(side * pixels_per_m) for side in PAGE_M)
     paper = board.image()
     column, row = (

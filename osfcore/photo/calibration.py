@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -53,31 +53,34 @@ class Sighting:
         size: width and height of the photograph as it was sent [px].
         points_m: on the board, whose centre is the origin [m].
         points_px: where they were found, in pixels of the photograph as it was sent, distortion included.
+        board: that was looked for.
     """
 
     name: str
     size: Size
     points_m: Points
     points_px: Points
+    board: Board = field(default_factory=Board)
 
 
-def sight(raw: RawPhotograph, name: str) -> Sighting:
+def sight(raw: RawPhotograph, name: str, board: Board) -> Sighting:
     """Find the board's corners in a photograph.
 
     Args:
         raw: the decoded photograph.
         name: of the photograph, for people.
+        board: that it shows.
 
     Raises:
         CorruptFile: naming the photograph, if no board or too little of it is found, and why.
     """
     try:
-        found, lens = board_points_through_lens(raw.eight_bit, Board())
+        found, lens = board_points_through_lens(raw.eight_bit, board)
     except InvalidInput as error:
         raise CorruptFile(shown(name), str(error).rstrip(".")) from None
     points = found.points_px if lens is None else lens.bent(found.points_px)
     scale = np.divide(raw.sent_size, raw.encoded.shape[1::-1])
-    return Sighting(name, raw.sent_size, found.points_m, points * scale)
+    return Sighting(name, raw.sent_size, found.points_m, points * scale, board)
 
 
 # One camera that fits the board's corners in several photographs: nonlinear least squares over camera and poses.
@@ -366,16 +369,19 @@ _IDEAS = (  # words; the board's tilt [rad]; place of its middle in the picture,
 )
 
 
-def best_next(theta: Theta, size: Size, distance_m: float, expected_m: Callable[[ThetaMatrix], float]) -> Advice | None:
+def best_next(
+    theta: Theta, size: Size, corners: Points, distance_m: float, expected_m: Callable[[ThetaMatrix], float]
+) -> Advice | None:
     """Return the idea after which the least error is to be expected; None if the board fits in the picture in none.
 
     Args:
         theta: of the camera.
         size: width and height of the picture [px].
+        corners: of the board's squares [m].
         distance_m: from which photographs have been taken [m].
         expected_m: error on the table if the camera's normal matrix had this added [m].
     """
-    found, corners = [], Board().corners_m()
+    found = []
     for words, tilt, middle, nearness in _IDEAS:
         pixel = np.array([*(np.array(size) / 2 * (1 + np.array(middle))), 1.0])
         place = nearness * distance_m * np.linalg.solve(matrix(theta), pixel)
@@ -493,10 +499,11 @@ def assess(views: Sequence[Sighting], table: Sighting | None = None, T_world_boa
     fit, size = fit_camera(every), every[0].size
     _check_agreement(every, fit)
     normals = [normal_matrix(fit.theta, pose, v.points_m) for v, pose in zip(every, fit.poses, strict=True)]
-    error_with = _error_on_table(fit, size, normals, None if table is None else T_world_board)
+    corners = every[0].board.corners_m()
+    error_with = _error_on_table(fit, size, normals, corners, None if table is None else T_world_board)
     error = error_with(np.zeros((INTRINSICS, INTRINSICS)))
     distance = float(np.median(np.linalg.norm(fit.poses[:, 3:], axis=1)))
-    advice = best_next(fit.theta, size, distance, lambda more: error_with(more).mean_m)
+    advice = best_next(fit.theta, size, corners, distance, lambda more: error_with(more).mean_m)
     spread = fit.noise_px**2 * covariance(np.sum([about_camera(normal) for normal in normals], axis=0))
     focal_std = float(np.sqrt(spread[0, 0]))
     names = [view.name for view in every]  # many phones call each photograph image.jpg
@@ -508,7 +515,7 @@ def assess(views: Sequence[Sighting], table: Sighting | None = None, T_world_boa
 
 
 def _error_on_table(
-    fit: CameraFit, size: Size, normals: Sequence[JointMatrix], place: Pose | None
+    fit: CameraFit, size: Size, normals: Sequence[JointMatrix], corners: Points, place: Pose | None
 ) -> Callable[[ThetaMatrix], TableError]:
     """Return a function from further information on theta to the error to be expected on the table.
 
@@ -516,13 +523,14 @@ def _error_on_table(
         fit: the camera.
         size: of its picture [px].
         normals: matrices of its photographs.
+        corners: of the board's squares [m].
         place: of the board on the table in the last of them; without, the error is that of a later photograph from a
             usual place, whose pose alone follows from it.
     """
     parts = [about_camera(normal) for normal in normals]
     if place is None:
         known, grid, pose = np.sum(parts, axis=0), workspace_grid(), usual_table_view(fit.theta, size)
-        last = normal_matrix(fit.theta, pose, Board().corners_m())
+        last = normal_matrix(fit.theta, pose, corners)
     else:
         known, grid, pose = np.sum(parts[:-1], axis=0), place.inverse().apply(workspace_grid()), fit.poses[-1]
         last = normals[-1]
@@ -561,6 +569,8 @@ def _check_photos(every: Sequence[Sighting]) -> None:
         if view.size != (width, height):
             given = f"it has {view.size[0]} x {view.size[1]} pixels and {shown(every[0].name)} has {width} x {height}"
             raise CorruptFile(shown(view.name), f"{given}; take all with one camera held the same way up, uncropped")
+        if view.board != every[0].board:
+            raise CorruptFile(shown(view.name), f"another board was looked for in it than in {shown(every[0].name)}")
     for one, other in itertools.combinations(every, 2):
         if len(one.points_px) == len(other.points_px) and np.abs(one.points_px - other.points_px).max() < _SAME_PX:
             reason = f"it shows the same as {shown(one.name)}; move the board or the camera"

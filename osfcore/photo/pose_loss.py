@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -620,3 +621,57 @@ def rotation_and_position(local: Pose) -> tuple[np.ndarray, np.ndarray]:
 
 def _half(surfels: Surfels) -> np.float32:
     return np.float32(_HALF_SIDE * surfels.spacing)
+
+
+# Whether what is printed on an object is found again where a pose shows it, patch by patch.
+#
+# The drawn albedo A and the photograph I are band-passed, and each patch p of the drawing is looked for within a few
+# pixels d of its place:
+#
+#     m = sum_p w_p max_d corr(A_p, I_p+d) / sum_p w_p,   w_p = |A_p| |I_p|.
+#
+# Right poses are seldom exact to a pixel, so that labels do not quite cover each other and their correlation falls;
+# patches that may move are found all the same. In a wrong pose they find what looks like them by chance.
+
+
+_PATCH_PX, _STEP_PX, _REACH_PX = 28, 14, 5
+_BAND_PX = 1.2, 7.0  # standard deviations, between which details count
+_FILLED, _FEWEST_PATCHES = 0.6, 8  # share of a patch that must show the object; fewer patches agree by chance
+_RIM = np.ones((5, 5), np.uint8)
+
+
+def print_match(loss: PoseLoss, pose: Pose) -> float:
+    """Return m of one pose over all windows: 1 where all of its print is found, 0 where too little of it is seen."""
+    found, weights, count = 0.0, 0.0, 0
+    for window in loss.windows:
+        index = draw(loss.surfels, window, pose[None])[0][0]
+        shown = index >= 0
+        albedo = loss.surfels.albedo[np.maximum(index, 0)].mean(axis=-1)
+        drawn, seen = _details(albedo, shown), _details(window.luminance, window.plain)
+        inside = cv2.erode((shown & window.plain).astype(np.uint8), _RIM).astype(np.float32)
+        places = (range(_REACH_PX, side - _PATCH_PX - _REACH_PX, _STEP_PX) for side in shown.shape)
+        for top, left in itertools.product(*places):
+            patch = np.s_[top : top + _PATCH_PX, left : left + _PATCH_PX]
+            if inside[patch].mean() < _FILLED:
+                continue
+            around = seen[top - _REACH_PX :, left - _REACH_PX :][
+                : _PATCH_PX + 2 * _REACH_PX, : _PATCH_PX + 2 * _REACH_PX
+            ]
+            template = drawn[patch] * inside[patch]
+            weight = float(np.linalg.norm(template) * np.linalg.norm(seen[patch] * inside[patch]))
+            if weight > 0:
+                alike = cv2.matchTemplate(around, template, cv2.TM_CCORR_NORMED, mask=inside[patch])
+                found += weight * float(np.nan_to_num(alike, posinf=0.0, neginf=0.0).max())
+                weights, count = weights + weight, count + 1
+    return found / weights if count >= _FEWEST_PATCHES else 0.0
+
+
+def _details(image: np.ndarray, mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Return what of an image's square root, about what people see, lies between two scales within a mask."""
+    inside = mask.astype(np.float32)
+    values = np.sqrt(np.maximum(image, 0)).astype(np.float32) * inside
+    fine, coarse = (
+        cv2.GaussianBlur(values, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(inside, (0, 0), sigma), 1e-3)
+        for sigma in _BAND_PX
+    )
+    return (fine - coarse) * inside

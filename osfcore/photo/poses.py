@@ -34,6 +34,7 @@ from osfcore.photo.pose_loss import (
     TablePrior,
     draw,
     object_windows,
+    print_match,
     signed_distance,
     surfels_of,
 )
@@ -470,20 +471,18 @@ class _FocalSearch:
 
     def moved(self, one: PhotoObject, focal: float) -> PhotoObject:
         """Return an object with its poses for a camera of this focal length, the best first."""
-        loss = self._loss(one, focal)
+        loss, sharp = (self._loss(one, focal, side) for side in (_FINE_SIDE, _SHARP_SIDE))
         poses = Pose.stacked(self._aligned(one, each.pose, focal)[0] for each in (one.best, *one.rivals))
-        ready = _photo_poses(poses, loss)
-        losses = np.array([each.loss for each in ready])
-        best, *rivals = (ready[k] for k in distinct(poses, losses, _ALIGNED, _APART_DEG))
+        best, *rivals = _ranked(poses, _photo_poses(poses, loss, sharp))
         return replace(one, best=best, rivals=tuple(rivals), doubt=doubt_of(one.name, best, rivals, loss))
 
     def _aligned(self, one: PhotoObject, pose: Pose, focal: float) -> tuple[Pose, float]:
         K = self._photo.intrinsics
-        return align(self._loss(one, focal), seen_through(pose, K, _with_focal(K, focal)))
+        return align(self._loss(one, focal, _FINE_SIDE), seen_through(pose, K, _with_focal(K, focal)))
 
-    def _loss(self, one: PhotoObject, focal: float) -> PoseLoss:
+    def _loss(self, one: PhotoObject, focal: float, side: int) -> PoseLoss:
         photo = replace(self._photo, intrinsics=_with_focal(self._photo.intrinsics, focal))
-        windows = object_windows([photo], one.name, _FINE_SIDE)
+        windows = object_windows([photo], one.name, side)
         return PoseLoss(windows, self._models.surfels(one.name, FINE_ACROSS), kind=self._config.loss)
 
 
@@ -564,6 +563,7 @@ class PhotoPose:
         iou: intersection over union of drawn outline and mask.
         residual: relative error of the colours.
         correlation: correlation of the band-passed images.
+        match: share of the print that is found again, see `print_match`.
     """
 
     pose: Pose
@@ -571,6 +571,7 @@ class PhotoPose:
     iou: float
     residual: float
     correlation: float
+    match: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -619,6 +620,7 @@ class PhotoStep:
 
 
 LEAST_RATIO = 1.15  # loss of another orientation over that of the best
+_FOUND_PRINT, _MORE_PRINT = 0.6, 0.15  # match of a pose that its print makes sure, and by how much more than others'
 _LEAST_IOU = 0.85
 _MOST_RESIDUAL = 0.55
 _MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
@@ -627,6 +629,11 @@ _MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
 def fits_outline(best: PhotoPose) -> bool:
     """Return whether the drawn outline fits the mask."""
     return best.iou >= _LEAST_IOU
+
+
+def has_its_print(best: PhotoPose, others: Sequence[PhotoPose]) -> bool:
+    """Return whether the print of a pose is found again, and that of other orientations clearly less."""
+    return best.match >= max([_FOUND_PRINT, *(other.match + _MORE_PRINT for other in others)])
 
 
 def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: PoseLoss) -> str:
@@ -643,7 +650,7 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
         return f"The outline of {name} does not fit its mask ({share}); check the name, the mask and the camera."
     if best.residual > _MOST_RESIDUAL:
         return f"{name} does not look like what the photo shows there; check the name and the mask."
-    if rivals and rivals[0].loss < LEAST_RATIO * best.loss:
+    if rivals and rivals[0].loss < LEAST_RATIO * best.loss and not has_its_print(best, rivals):
         return f"{name} looks nearly the same in another orientation; choose between the two pictures."
     if min(window.cut for window in loss.windows) > _MOST_CUT:
         return f"{name} is cut off by the edge of the photo, so that its distance is uncertain."
@@ -838,18 +845,31 @@ def _on_table(
     start, surfels = time.perf_counter(), models.surfels(found.name, FINE_ACROSS)
     seen = object_windows([replace(photo, T_world_camera=table.T_world_camera, on_table=True)], found.name, _SHARP_SIDE)
     sharp = PoseLoss(seen, surfels, models.table_prior(found.name), config.loss)
-    plain = PoseLoss(object_windows([photo], found.name, _FINE_SIDE), surfels, kind=config.loss)
+    plain, sharp_plain = (
+        PoseLoss(object_windows([photo], found.name, side), surfels, kind=config.loss)
+        for side in (_FINE_SIDE, _SHARP_SIDE)
+    )
     pose = table.T_world_camera.inverse() @ align(sharp, table.T_world_camera @ found.best.pose)[0]
-    best = _photo_poses(pose[None], plain)[0]
+    best = _photo_poses(pose[None], plain, sharp_plain)[0]
     doubt = doubt_of(found.name, best, found.rivals, plain)
     return replace(found, best=best, doubt=doubt, refine_s=found.refine_s + time.perf_counter() - start)
 
 
-def _photo_poses(poses: Pose, loss: PoseLoss) -> list[PhotoPose]:
-    """Return poses with the parts of each one's loss."""
+def _photo_poses(poses: Pose, loss: PoseLoss, sharp: PoseLoss) -> list[PhotoPose]:
+    """Return poses with the parts of each one's loss, and what is found of their print in sharp windows."""
     terms = loss.terms(poses)
-    parts = zip(terms.losses, terms.iou, terms.residual, terms.correlation, strict=True)
+    matches = [print_match(sharp, poses[k]) for k in range(len(terms.losses))]
+    parts = zip(terms.losses, terms.iou, terms.residual, terms.correlation, matches, strict=True)
     return [PhotoPose(poses[k], *(float(v) for v in values)) for k, values in enumerate(parts)]
+
+
+def _ranked(poses: Pose, ready: Sequence[PhotoPose]) -> list[PhotoPose]:
+    """Return the best pose, then its rivals; the one whose print alone is found again comes first."""
+    order = distinct(poses, np.array([pose.loss for pose in ready]), _ALIGNED, _APART_DEG)
+    ranked = [ready[k] for k in order]
+    first = max(ranked, key=lambda pose: pose.match)
+    others = [pose for pose in ranked if pose is not first]
+    return [first, *others] if has_its_print(first, others) else ranked
 
 
 def find_object(models: PhotoModels, photos: Photos, name: str, rng: Rng, config: PhotoConfig) -> PhotoObject:
@@ -872,7 +892,6 @@ def find_object(models: PhotoModels, photos: Photos, name: str, rng: Rng, config
     middle = time.perf_counter()
     poses, losses = cma_search(fine, poses[:_ALIGNED], 0.35, rng)
     poses = Pose.stacked(align(sharp, poses[k])[0] for k in distinct(poses, losses, _ALIGNED, _NEAR_DEG))
-    ready = _photo_poses(poses, fine)
-    best, *rivals = (ready[k] for k in distinct(poses, np.array([p.loss for p in ready]), _ALIGNED, _APART_DEG))
+    best, *rivals = _ranked(poses, _photo_poses(poses, fine, sharp))
     doubt = doubt_of(name, best, rivals, fine)
     return PhotoObject(name, best, tuple(rivals), doubt, middle - start, time.perf_counter() - middle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 
 import cv2
@@ -22,7 +23,11 @@ _WORKING_SIDE = 200  # of the box at most [px]: fine enough for an outline, and 
 _MARGIN = 0.2  # of the box's sides: what lies so near around it is the sample of the background
 _CLICK_RADIUS = 0.06  # of the box's shorter side: what a click speaks for
 _NOISE_LEVELS, _NOISE_RADIUS = 20.0, 3.0  # differences and distances that smoothing evens out [levels of 255, px]
-_CORE = 0.8  # axes of the ellipse in the box, per side of the box, that one of the two searches begins from
+_CORE, _SURE_CORE = 0.8, 0.6  # axes, per side of the box, of ellipses in it: probably object, and taken for it
+_FORCED = 0.02  # by which the misfit of what begins from the second must be less: it holds what may be no object
+_CENTRAL = 0.2  # of the sides: clicks within this distance of the middle do not say that something else is in it
+_MOST_MISFIT = 0.3  # above, an outline is doubtful; boxes drawn with usual care have 0.05 to 0.25
+_BEHIND, _FRONT = 0.04, 0.1  # misfit gained without what two outlines share: at most, if it is the other's; at least
 _ITERATIONS = 3
 _OUTLINE_SIGMA = 0.7  # over which the outline is smoothed [px of the reduced picture]
 _WHAT = "box of the object [px]"
@@ -38,9 +43,10 @@ def propose_mask(
 ) -> Mask:
     """Find the mask of an object that a person points at.
 
-    GrabCut runs twice, beginning from the whole box and from an ellipse in it; the result whose extent fits the box
-    better is taken. Of each those parts remain that hold a click or a stroke (without such, the largest), and holes
-    are filled unless they are marked. The same input always gives the same mask.
+    GrabCut runs three times: from the whole box, from an ellipse in it that is probably the object, and, unless a
+    click lies elsewhere, from a smaller one that surely is. The result whose extent fits the box best is taken. Of
+    each those parts remain that hold a click or a stroke (without such, the largest), and holes are filled unless they
+    are marked. The same input always gives the same mask.
 
     Args:
         image: encoded RGB, as people see it.
@@ -62,9 +68,11 @@ def propose_mask(
     picture = cv2.bilateralFilter(window.cut(image), -1, _NOISE_LEVELS, _NOISE_RADIUS)
     corners = np.round(_within(window, np.reshape(box, (2, 2)))).astype(int)
     marks = _marks(window, corners, clicks, strokes)
-    found = [_tidied(_cut(picture, start), marks) for start in _starts(marks, corners)]
-    best = min(found, key=lambda mask: _misfit(mask, corners)).astype(np.float32)
-    soft = cv2.GaussianBlur(best, (0, 0), _OUTLINE_SIGMA, borderType=cv2.BORDER_REPLICATE)
+    *free, forced = (_tidied(_cut(picture, start), marks) for start in _starts(marks, corners))
+    best = min(free, key=lambda mask: _misfit(mask, corners))
+    if _are_central(foreground, box) and _misfit(forced, corners) < _misfit(best, corners) - _FORCED:
+        best = forced
+    soft = cv2.GaussianBlur(best.astype(np.float32), (0, 0), _OUTLINE_SIGMA, borderType=cv2.BORDER_REPLICATE)
     mask = window.placed(soft, shape)
     if not mask.any():
         raise InvalidInput(_WHAT, _corners_text(box), "around something that differs from what surrounds it")
@@ -73,6 +81,9 @@ def propose_mask(
 
 def propose_masks(image: Picture, boxes: Mapping[str, Box], clicks: Mapping[str, Points]) -> dict[str, Mask]:
     """Find the masks of several objects: clicks on one are background for the others.
+
+    What two outlines both hold is that object's whose extent fits its box clearly worse without it, if the other's
+    does not: what lies in front of another object is seen whole.
 
     Args:
         image: encoded RGB, as people see it.
@@ -86,7 +97,32 @@ def propose_masks(image: Picture, boxes: Mapping[str, Box], clicks: Mapping[str,
     for name, box in boxes.items():
         others = np.concatenate([np.zeros((0, 2)), *(points for other, points in clicks.items() if other != name)])
         masks[name] = propose_mask(image, box, clicks[name], others)
+    inside = {name: _checked_box(box, *image.shape[:2]) for name, box in boxes.items()}
+    for pair in itertools.combinations(masks, 2):
+        both = np.logical_and(*(masks[name] for name in pair))
+        if both.any():
+            lacks = {n: _misfit(masks[n] & ~both, inside[n]) - _misfit(masks[n], inside[n]) for n in pair}
+            behind, front = sorted(pair, key=lacks.__getitem__)
+            if lacks[behind] < _BEHIND and lacks[front] > _FRONT:
+                masks[behind] = masks[behind] & ~both
     return masks
+
+
+def outline_doubt(name: str, box: Box, mask: Mask) -> str:
+    """Return a sentence if an outline does not fill the box that it comes from; "" if it does.
+
+    Args:
+        name: of the object, for people.
+        box: that was drawn around it [px].
+        mask: that was found of it.
+    """
+    inside = _checked_box(box, *mask.shape)
+    if _misfit(mask, inside) <= _MOST_MISFIT:
+        return ""
+    spans = np.ptp(_extent(mask), axis=0) / np.ptp(np.reshape(inside, (2, 2)), axis=0)
+    across, down = np.round(100 * spans).astype(int).tolist()
+    found = f"The outline of {name} spans {across} % of its box's width and {down} % of its height"
+    return f"{found}: draw the box closely around all of the object, or correct the outline."
 
 
 def _window(box: Box, height: int, width: int) -> WindowFrame:
@@ -156,13 +192,24 @@ def _marks(window: WindowFrame, corners: np.ndarray, clicks: Pair, strokes: Pair
 
 
 def _starts(marks: Labels, corners: np.ndarray) -> list[Labels]:
-    """Return two starts of GrabCut: all that is unknown is probably object, or only an ellipse in the middle."""
-    (x0, y0), (x1, y1) = corners
-    core = np.zeros_like(marks)
-    middle, axes = ((x0 + x1) / 2, (y0 + y1) / 2), (_CORE * (x1 - x0), _CORE * (y1 - y0))
-    cv2.ellipse(core, (middle, axes, 0.0), 1, -1)
-    outer = np.where((marks == cv2.GC_PR_FGD) & (core == 0), cv2.GC_PR_BGD, marks)
-    return [marks.copy(), outer.astype(np.uint8)]
+    """Return three starts of GrabCut: all unknown is probably object, only an ellipse is, a smaller one surely is."""
+    unknown = marks == cv2.GC_PR_FGD
+    outer = np.where(unknown & ~_ellipse(marks.shape, corners, _CORE), cv2.GC_PR_BGD, marks)
+    sure = np.where(unknown & _ellipse(marks.shape, corners, _SURE_CORE), cv2.GC_FGD, marks)
+    return [marks.copy(), outer.astype(np.uint8), sure.astype(np.uint8)]
+
+
+def _ellipse(shape: tuple[int, ...], corners: np.ndarray, share: float) -> Mask:
+    """Return the ellipse in the middle of a box whose axes are that share of its sides."""
+    core = np.zeros(shape, np.uint8)
+    sides = share * (corners[1] - corners[0])
+    cv2.ellipse(core, (corners.mean(axis=0).tolist(), sides.tolist(), 0.0), 1, -1)
+    return core > 0
+
+
+def _are_central(clicks: Points, box: Box) -> bool:
+    low, high = np.reshape(box, (2, 2))
+    return bool(np.all(np.linalg.norm((clicks - low) / (high - low) - 0.5, axis=1) < _CENTRAL))
 
 
 def _cut(picture: Picture, labels: Labels) -> Mask:
@@ -190,10 +237,15 @@ def _tidied(found: Mask, marks: Labels) -> Mask:
     return kept | holes[1:-1, 1:-1]
 
 
-def _misfit(mask: Mask, corners: np.ndarray) -> float:
-    """Return how far a mask's extent is from the box, summed over its four sides, each per side of the box."""
+def _extent(mask: Mask) -> np.ndarray:
+    """Return the top left and the bottom right corner of what a mask holds [px]."""
+    xs, ys = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    return np.array([[xs[0], ys[0]], [xs[-1] + 1, ys[-1] + 1]])
+
+
+def _misfit(mask: Mask, box: np.ndarray | Box) -> float:
+    """Return how far a mask's extent is from a box, summed over its four sides, each per side of the box."""
     if not mask.any():
         return np.inf
-    xs, ys = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    extent = np.array([[xs[0], ys[0]], [xs[-1] + 1, ys[-1] + 1]])
-    return float((np.abs(extent - corners) / (corners[1] - corners[0])).sum())
+    corners = np.reshape(box, (2, 2))
+    return float((np.abs(_extent(mask) - corners) / (corners[1] - corners[0])).sum())

@@ -14,7 +14,6 @@ from osfcore.geometry.poses import Pose
 from osfcore.io.scene_file import CameraJson
 from osfcore.photo.board import (
     CONTRADICTED,
-    PAGE_M,
     UNKNOWN_FOCAL,
     Board,
     BoardView,
@@ -33,7 +32,9 @@ from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, int
 # The summary of an estimation: poses on the table if it is known, lamp, camera, and notes for the user.
 
 
-def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels, notes: Sequence[str]) -> FoundScene:
+def summarised(
+    photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels, notes: Sequence[str], board: Board
+) -> FoundScene:
     """Summarise an estimation.
 
     Args:
@@ -41,6 +42,7 @@ def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModel
         step: the last step of the estimation.
         models: models of the objects.
         notes: sentences for the user about the photo.
+        board: that shows the table, if one is in view.
     """
     T_table_world, table, notes = Pose.identity(), "board" if photos[0].on_table else None, list(notes)
     if step.table is not None:
@@ -52,7 +54,7 @@ def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModel
         notes.append(f"The focal length, {focal}, was found from how the objects stand; it may be off by a fifth.")
     light = None
     try:
-        light, unknown = _light(photos, step, models)
+        light, unknown = _light(photos, step, models, board)
         notes += unknown
     except InvalidInput as error:
         notes.append(f"The light could not be determined: {error}")
@@ -61,13 +63,15 @@ def summarised(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModel
     return FoundScene(table=table, objects=objects, light=light, camera=first, other_cameras=others, notes=notes)
 
 
-def _light(photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels) -> tuple[FoundLight, list[str]]:
+def _light(
+    photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels, board: Board
+) -> tuple[FoundLight, list[str]]:
     """Return the lamp, in the frame of the table if there is one, and notes on what is unknown about it."""
     surfels, found = [models.surfels(each.name, FINE_ACROSS) for each in step.found], step.found
     if step.table is None and not photos[0].on_table:
         light = _found_light(photo_light(photos[0], found, surfels))
         return light, ["The distance of the lamp cannot be determined without a known table."]
-    covered: tuple[float, float] | None = PAGE_M
+    covered: tuple[float, float] | None = board.sheet_m
     if step.table is not None:
         place, covered = step.table.T_world_camera, None
         photos = [replace(photos[0], T_world_camera=place, on_table=True)]
@@ -138,12 +142,13 @@ class Located:
         return self.lens.straightened(mask.astype(np.float32)) > 0.5
 
 
-def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
+def locate(raw: RawPhotograph, focal_px: float | None, board: Board) -> Located:
     """Find the camera.
 
     Args:
         raw: the decoded photo.
         focal_px: focal length in pixels of the photo as it was sent; None if it is unknown.
+        board: board that may be in view.
 
     Raises:
         InvalidInput: if the focal length makes no sense, or the board contradicts it.
@@ -160,7 +165,7 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
         if not 1 / _MOST_APART < focal_px / written < _MOST_APART:
             notes.append(f"The focal length {focal_px:g} differs from the one in the photo's EXIF data, {written:.0f}.")
     try:
-        view, lens, source = _over_board(raw, given, notes)
+        view, lens, source = _over_board(raw, board, given, notes)
     except InvalidInput as error:
         if error.what == CONTRADICTED:
             raise
@@ -179,12 +184,13 @@ def locate(raw: RawPhotograph, focal_px: float | None = None) -> Located:
     return Located(straight, view.intrinsics, lens, source, view.T_world_camera, tuple(notes))
 
 
-def locate_calibrated(raw: RawPhotograph, camera: KnownCamera) -> Located:
+def locate_calibrated(raw: RawPhotograph, camera: KnownCamera, board: Board) -> Located:
     """Return the pose of a calibrated camera: from the calibration, or else from a board in view.
 
     Args:
         raw: the decoded photo.
         camera: the calibrated camera.
+        board: board that may be in view.
 
     Raises:
         InvalidInput: if the photo has another shape than those that the camera was calibrated with.
@@ -194,22 +200,24 @@ def locate_calibrated(raw: RawPhotograph, camera: KnownCamera) -> Located:
     notes, pose, missing = [*raw.notes, "The camera is the one that was calibrated."], camera.T_world_camera, ""
     if pose is None:
         try:
-            pose = locate_board(straight.eight_bit, Board(), lens.intrinsics).T_world_camera
+            pose = locate_board(straight.eight_bit, board, lens.intrinsics).T_world_camera
         except InvalidInput as error:
             missing = str(error)
             notes.append(f"The calibration does not hold the camera's pose, and no board was found. {error}")
     return Located(straight, lens.intrinsics, lens, "given", pose, tuple(notes), missing)
 
 
-def _over_board(raw: RawPhotograph, given: Intrinsics | None, notes: list[str]) -> tuple[BoardView, Lens, FocalSource]:
+def _over_board(
+    raw: RawPhotograph, board: Board, given: Intrinsics | None, notes: list[str]
+) -> tuple[BoardView, Lens, FocalSource]:
     """Return camera, lens and source of the focal length. A focal length that the board does not show is guessed."""
     try:
-        return *locate_board_through_lens(raw.eight_bit, Board(), given), "board" if given is None else "given"
+        return *locate_board_through_lens(raw.eight_bit, board, given), "board" if given is None else "given"
     except InvalidInput as error:
         if error.what != UNKNOWN_FOCAL:
             raise
         guess, note = guessed_intrinsics(raw)
-        found = locate_board_through_lens(raw.eight_bit, Board(), guess)
+        found = locate_board_through_lens(raw.eight_bit, board, guess)
         notes.append(f"From this angle the board does not show the focal length. {note}")
         return *found, _guess_source(raw)
 

@@ -66,7 +66,7 @@ async function send(file) {
   const bar = byId("calibration-bar");
   const twins = [...photos, table].filter((each) => each?.file === file.name).length; // many phones call each photo image.jpg
   const name = `${file.name.slice(-NAME_MAX + 6)}${twins ? ` (${twins + 1})` : ""}`;
-  const query = new URLSearchParams({ name });
+  const query = new URLSearchParams({ name, board: byId("calibration-board").value.trim() });
   bar.hidden = false;
   try {
     const sent = await upload(`calibration/photos?${query}`, file, (share) => { bar.value = share; }, "application/octet-stream");

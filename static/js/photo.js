@@ -47,7 +47,7 @@ function tell() {
     add: `Click on the ${name.toLowerCase()}, or paint over what its outline lacks.`,
     remove: `Click beside the ${name.toLowerCase()}, or paint over what does not belong to it.`,
   };
-  byId("photo-told").textContent = chosen ? words[toolOf()] : "No object has a field yet; train one in Your objects.";
+  byId("photo-told").textContent = chosen ? marked()?.doubt || words[toolOf()] : "No object has a field yet; train one in Your objects.";
 }
 
 function choose(name, tool = marked(name) ? "add" : "box") {
@@ -93,7 +93,8 @@ function entry(object) {
   pick.addEventListener("click", () => choose(object.name));
   const drop = el("button", { type: "button", className: "plain danger", textContent: "Remove", attributes: { "aria-label": `Remove: ${object.label}` } });
   drop.addEventListener("click", () => act(drop, async () => show(await remove(objectPath(object.name)))));
-  const item = el("li", {}, el("div", { className: "marked" }, pick, drop), ...(object.found ? posesOf(object) : []));
+  const doubt = object.doubt ? el("p", { className: "missing", textContent: object.doubt }) : null;
+  const item = el("li", {}, el("div", { className: "marked" }, pick, drop), doubt, ...(object.found ? posesOf(object) : []));
   item.dataset.object = object.name;
   item.classList.toggle("chosen", object.name === chosen);
   return item;
@@ -145,6 +146,7 @@ function show(next) {
   byId("photo-notes").replaceChildren(...photo.notes.map((note) => el("li", { textContent: inWords(note) })));
   byId("photo-camera").hidden = photo.focal_source === "board";
   byId("photo-camera").elements.focal.value = Math.round(photo.focal_px);
+  byId("photo-board").elements.board.value = photo.board;
   byId("photo-objects").replaceChildren(...photo.objects.map(entry));
   drawTogether();
   drawJob(photo.job);
@@ -296,6 +298,11 @@ export function setUpPhoto() {
     event.preventDefault();
     const { focal } = event.target.elements;
     act(event.submitter, async () => show(await patch(path(), { focal_px: focal.value ? Number(focal.value) : null })));
+  });
+  byId("photo-board").addEventListener("submit", (event) => {
+    event.preventDefault();
+    const { board } = event.target.elements;
+    act(event.submitter, async () => show(await patch(path(), { focal_px: null, board: board.value.trim() })));
   });
   byId("use-camera").addEventListener("click", () => act(byId("use-camera"), async () => show(await patch(path(), { focal_px: null, camera: known("camera") }))));
   watch("camera", (camera) => { byId("photo-calibrated").hidden = !camera; });

@@ -58,6 +58,7 @@ class PhotoParams(JobParams):
         seed: of the searches.
         notes: what a person should know of the first.
         photos: all of them.
+        board: that the first may show, as `board_of` reads it.
     """
 
     photo: str
@@ -66,6 +67,7 @@ class PhotoParams(JobParams):
     seed: int
     notes: tuple[str, ...]
     photos: tuple[PhotoInput, ...]
+    board: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +92,7 @@ def photo_job(params: PhotoParams, place: JobContext) -> Iterator[Finding]:
     Raises:
         OsfError: if an object has no field, nothing can be found, or the disk refuses.
     """
+    from osfcore.photo.board import board_of
     from osfcore.photo.poses import PhotoConfig, PhotoModels, estimate_photo
     from osfcore.photo.summary import summarised
 
@@ -106,7 +109,7 @@ def photo_job(params: PhotoParams, place: JobContext) -> Iterator[Finding]:
     assert step is not None
     photos[0] = step.as_seen(photos[0])
     yield Finding(step.progress.total, step.progress.total + 1, "The lamp", len(step.found))
-    write_json(place.folder / FOUND, encode(summarised(photos, step, models, params.notes)))
+    write_json(place.folder / FOUND, encode(summarised(photos, step, models, params.notes, board_of(params.board))))
     for found in step.found:
         if found.name in photos[0].masks:
             _draw_sheets(place.folder, models, photos[0], found)

@@ -119,9 +119,8 @@ def _driven(
     drive: RobotDrive, progress: RobotProgress, may_move: threading.Event, place: JobContext
 ) -> Iterator[RobotProgress]:
     assert place.orders is not None
-    progress = replace(progress, doubts=drive.doubts)
     for event in drive.run():
-        progress = progress.after(event)
+        progress = replace(progress.after(event), doubts=drive.doubts)
         if isinstance(event, Finished):
             progress = replace(progress, drives="over")
         if isinstance(event, Observed):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from osfcore.geometry.poses import Pose
+from osfcore.photo.board import Board
 from osfcore.photo.calibration import Calibration, Sighting
 from osfcore.photo.camera_files import KnownCamera
 
@@ -21,11 +22,13 @@ class ReadPhoto:
         data: the file as it was sent.
         focal_px: focal length in pixels of the photo as it was sent; None where nobody knows.
         camera: that took it, if it was calibrated; the focal length does not count then.
+        board: that may be in view.
     """
 
     data: bytes
     focal_px: float | None = None
     camera: KnownCamera | None = None
+    board: Board = field(default_factory=Board)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -107,10 +110,12 @@ class MaskFound:
     Attributes:
         png: 255 where the object is.
         outline: closed polygons around it, and around its holes.
+        doubt: a sentence if it does not fill its box; "" if it does.
     """
 
     png: bytes
     outline: tuple[Points, ...]
+    doubt: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,10 +125,12 @@ class SightBoard:
     Attributes:
         data: the file as it was sent.
         name: of the photograph, for people.
+        board: that is looked for.
     """
 
     data: bytes
     name: str
+    board: Board = field(default_factory=Board)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

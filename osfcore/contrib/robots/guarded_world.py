@@ -18,7 +18,7 @@ from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.geometry.states import Observation
 from osfcore.geometry.workspace import STEP_S, check_action
 from osfcore.io.image_file import to_uint8
-from osfcore.photo.segmentation import Box, propose_masks
+from osfcore.photo.segmentation import Box, outline_doubt, propose_masks
 
 _OUTSIDE_M = 0.01  # a pusher may have come so far outside the box by itself, and returns
 
@@ -246,10 +246,14 @@ class OutlinedWorld:
         boxes: boxes (x0, y0, x1, y1) [px] in the images of `observe`, by names of camera and object. A camera without a
             box for each object is left out of observations with masks, since a missing mask would mean that the object
             is not visible.
+
+    Attributes:
+        doubts: a sentence for each outline of the last observation that does not fill its box.
     """
 
     def __init__(self, world: World, boxes: CameraBoxes) -> None:
         self._world, self._boxes = world, boxes
+        self.doubts: tuple[str, ...] = ()
         self.reset, self.act, self.close = world.reset, world.act, world.close
 
     def observe(self, *, masks: bool = False) -> Observation:
@@ -270,11 +274,14 @@ class OutlinedWorld:
             allowed = "around each object in at least one camera, for the robot delivers no masks"
             raise InvalidInput("boxes", "missing", allowed)
         marked = without_cameras(seen, unmarked)
-        found = []
+        found, doubts = [], []
         for camera, image in zip(marked.cameras, marked.images, strict=True):
             boxes = self._boxes[camera.name]
             # A click in a box's middle marks the object, and background of the others.
             clicks = {name: np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]) for name, (x0, y0, x1, y1) in boxes.items()}
             masks_of = propose_masks(to_uint8(srgb_of_linear(image)), boxes, clicks)
             found.append([masks_of[name] for name in seen.names])
+            names = {name: f"{name} in the picture of {camera.name}" for name in seen.names}
+            doubts += [outline_doubt(names[name], boxes[name], masks_of[name]) for name in seen.names]
+        self.doubts = tuple(doubt for doubt in doubts if doubt)
         return replace(marked, masks=np.array(found))

@@ -91,6 +91,10 @@ def test_a_photo_is_kept_with_what_its_file_tells(service):
     assert shown.size == (64, 48)
     changed = service.patch(f"/api/photos/{photo['id']}", json={"focal_px": 100}).json()
     assert changed["focal_px"] == 100
+    mine = "5x7,0.04,0.03,DICT_5X5_100,legacy"
+    assert service.patch(f"/api/photos/{photo['id']}", json={"focal_px": 100, "board": mine}).json()["board"] == mine
+    assert service.patch(f"/api/photos/{photo['id']}", json={"focal_px": 90}).json()["board"] == mine
+    assert service.patch(f"/api/photos/{photo['id']}", json={"focal_px": 90, "board": ""}).json()["board"] == ""
     assert service.delete(f"/api/photos/{photo['id']}").status_code == 204
     refuses(service.get(f"/api/photos/{photo['id']}"), 404, "no such photo")
 
@@ -151,6 +155,8 @@ def test_what_makes_no_sense_is_told(service):
     refuses(service.post("/api/photos", content=b"a text", headers=ANY), 422, "no picture that can be read")
     refuses(service.post("/api/photos", content=b"{}", headers={"Content-Type": "application/json"}), 415, "photo")
     refuses(service.post("/api/photos?focal_px=2", content=gray(), headers=ANY), 422, "focal length")
+    refuses(service.post("/api/photos?board=5x7", content=gray(), headers=ANY), 422, "COLUMNSxROWS")
+    refuses(service.post("/api/calibration/photos?board=5x7", content=gray(), headers=ANY), 422, "COLUMNSxROWS")
     photo = send(service, gray())
     path = f"/api/photos/{photo['id']}"
     refuses(service.post(f"{path}/find", json={}), 409, "No object is marked")

@@ -1,6 +1,7 @@
 """What the process that looks at photographs answers, called directly."""
 
 import io
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -77,6 +78,17 @@ def test_a_box_and_a_click_find_the_object_and_its_outline():
     drawn = np.zeros(mask.shape, np.uint8)
     cv2.fillPoly(drawn, [np.round(np.array(line)).astype(np.int32) for line in outline], 1)
     assert (drawn.astype(bool) ^ mask).sum() < 0.03 * mask.sum()
+
+
+def test_an_outline_that_misses_its_box_is_doubted_until_it_is_painted():
+    left, top, right, bottom = BOX
+    far = (left - 8.0, top - 8.0, right + 1.2 * (right - left), bottom + 8.0)
+    wide = Mark(far, ((left + 20.0, 140.0),))
+    assert "width" in carry_out(FindMask(picture("JPEG"), wide)).doubt
+    painted = replace(wide, strokes=(Stroke(True, 3.0, ((left + 20.0, 140.0),)),))
+    assert carry_out(FindMask(picture("JPEG"), painted)).doubt == ""
+    close = Mark((left - 4.0, top - 4.0, right + 4.0, bottom + 4.0))
+    assert carry_out(FindMask(picture("JPEG"), close)).doubt == ""
 
 
 def test_the_last_stroke_of_the_brush_counts():

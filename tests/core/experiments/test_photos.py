@@ -81,6 +81,7 @@ def test_an_object_is_measured_against_its_truth(scene, tmp_path, start, plane, 
     assert report["objects_total"] == 1
     assert report["iou_median"] == report["iou_min"] > 0.9
     assert (report["mask_iou_min"] == 1) == (masks == "given")
+    assert report["boxes_unfilled"] == 0
     assert report["mask_iou_median"] == report["mask_iou_min"] > 0.85
     assert report["frac_10deg"] == report["depth_within_10mm"] == 1
     assert report["wrong_unflagged"] == 0

@@ -12,6 +12,8 @@ from osfcore.geometry.poses import rotation_angle
 from osfcore.photo.board import (
     RULER_M,
     Board,
+    SeenPrint,
+    board_of,
     board_pdf,
     board_points,
     board_view,
@@ -20,6 +22,7 @@ from osfcore.photo.board import (
     locate_board_through_lens,
     page_image,
     planar_pose,
+    print_in,
 )
 from osfcore.photo.lens import Lens
 from tests.support.errors import about
@@ -140,16 +143,85 @@ def test_what_is_no_photograph_and_wrong_intrinsics_are_refused(slanted):
     ("wrong", "what"),
     [
         ({"columns": 2}, "squares"),
-        ({"square_m": 0.05, "marker_m": 0.04}, "side"),
+        ({"columns": 21, "dictionary": "DICT_4X4_1000"}, "squares"),
+        ({"square_m": 1.5, "marker_m": 1.0}, "square_m"),
         ({"square_m": float("nan")}, "board"),
         ({"marker_m": 0.044}, "marker_m"),
         ({"columns": 20, "rows": 15, "square_m": 0.012, "marker_m": 0.009}, "squares"),
         ({"dictionary": "DICT_4x4_50"}, "DICT_4x4_50"),
     ],
 )
-def test_boards_that_cannot_be_printed_are_refused(wrong, what):
+def test_boards_that_cannot_be_are_refused(wrong, what):
     with pytest.raises((InvalidInput, UnknownName), check=about(what)):
         Board(**wrong)
+
+
+def test_a_board_that_is_larger_than_the_page_is_not_printed():
+    with pytest.raises(InvalidInput, check=about("side of the board")):
+        page_image(Board(square_m=0.05, marker_m=0.04), 1000)
+
+
+# Boards of others.
+
+
+OTHERS = [
+    Board(5, 4, 0.04, 0.03, "DICT_6X6_250", legacy=True),
+    Board(6, 4, legacy=True),
+    Board(7, 5, 0.036, 0.02, "DICT_5X5_1000"),
+    Board(8, 5, 0.03, 0.022, "DICT_APRILTAG_36h11"),
+]
+
+
+@pytest.mark.parametrize("board", OTHERS, ids=str)
+def test_another_board_is_named_and_found_once_it_is_described(board):
+    rng = np.random.default_rng(5)
+    view = board_photograph(rng, (960, 720), board, random_camera(rng, (960, 720), (0.5, 0.5), (50, 60)))
+    with pytest.raises(InvalidInput, match=f"{board.columns} x {board.rows} squares") as refused:
+        locate_board(view.image, BOARD, view.intrinsics)
+    form = re.search(r"\d+x\d+,SQUARE,MARKER,\w+(,legacy)?", str(refused.value)).group()
+    described = board_of(form.replace("SQUARE", str(board.square_m)).replace("MARKER", str(board.marker_m)))
+    assert described.legacy == board.legacy
+    assert_near(locate_board(view.image, described, view.intrinsics), view)
+
+
+@pytest.mark.parametrize("rising", [False, True])
+def test_a_grid_of_markers_is_told_from_a_board(rising):
+    """Kalibr's grids count their rows from the bottom."""
+    numbers = np.arange(20).reshape(5, 4)[:: -1 if rising else 1]
+    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    markers = [[np.pad(tags.generateImageMarker(int(n), 80), 15, constant_values=255) for n in row] for row in numbers]
+    seen = print_in(np.pad(np.block(markers), 60, constant_values=255))
+    assert seen == SeenPrint(4, 5, "DICT_APRILTAG_36h11", "rising grid" if rising else "grid", seen.marker)
+    assert seen.marker == pytest.approx(80 / 110, abs=0.02)
+    assert not seen.is_charuco
+
+
+def test_a_photograph_without_markers_shows_no_print(slanted):
+    assert print_in(np.full((480, 640), 128, np.uint8)) is None
+    assert print_in(cv2.cvtColor(slanted.image, cv2.COLOR_RGB2GRAY)).is_of(BOARD)
+
+
+def test_a_board_is_described_by_its_squares_sides_and_dictionary():
+    assert board_of("5x7,0.04,0.03,DICT_5X5_100") == Board(5, 7, 0.04, 0.03, "DICT_5X5_100")
+    assert board_of("8 X 6, 0.1, 0.08, DICT_4X4_250, legacy") == Board(8, 6, 0.1, 0.08, "DICT_4X4_250", legacy=True)
+    assert board_of("") == Board()
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("5x7", "board"),
+        ("5x7,40 mm,30 mm,DICT_5X5_100", "board"),
+        ("5x7,0.04,0.03", "board"),
+        ("5x7,0.04,0.03,DICT_5X5_100,old", "end"),
+        ("5x7,40,30,DICT_5X5_100", "square_m"),
+        ("5x7,0.04,0.05,DICT_5X5_100", "marker_m"),
+        ("5x7,0.04,0.03,5X5_100", "5X5_100"),
+    ],
+)
+def test_what_describes_no_board_is_refused(text, what):
+    with pytest.raises((InvalidInput, UnknownName), check=about(what)):
+        board_of(text)
 
 
 # Distortion of a lens, from the board in one photograph.

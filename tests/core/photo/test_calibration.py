@@ -13,12 +13,12 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, rotation_angle
 from osfcore.io.files import write_json
 from osfcore.io.scene_file import camera_from_json
-from osfcore.photo.board import planar_pose
+from osfcore.photo.board import Board, planar_pose
 from osfcore.photo.calibration import assess, board_place, calibrated_camera, calibration_to_json, sight, workspace_grid
 from osfcore.photo.camera_files import known_camera, read_camera
 from osfcore.photo.read_photograph import RawPhotograph
 from osfcore.photo.summary import locate, locate_calibrated
-from tests.support.boards import RADIAL, SIZE, VARIED, K, on_table, project, sighting, sightings
+from tests.support.boards import RADIAL, SIZE, VARIED, K, on_table, project, sighting, sightings, tilted
 from tests.support.errors import about
 
 # camera.json: what is written is read, and photographs of any size are taken as the calibrated camera's.
@@ -61,21 +61,21 @@ def test_what_is_written_is_read_also_as_a_camera_of_a_scene(found, camera_json,
 @pytest.mark.slow
 def test_a_photograph_is_straightened_and_placed_as_calibrated(camera_json, raw):
     fixed, free = known_camera(camera_json), known_camera({**camera_json, "T_world_camera": None})
-    located = locate_calibrated(raw, fixed)
+    located = locate_calibrated(raw, fixed, Board())
     assert (located.source, located.T_world_camera) == ("given", fixed.T_world_camera)
-    over_board = locate_calibrated(raw, free)
+    over_board = locate_calibrated(raw, free, Board())
     np.testing.assert_allclose(over_board.T_world_camera.matrix(), POSE.matrix(), atol=2e-3)
     np.testing.assert_allclose(over_board.intrinsics, K, atol=1e-5)
     blank = replace(raw, encoded=np.full_like(raw.encoded, 128))
-    nowhere = locate_calibrated(blank, free)
+    nowhere = locate_calibrated(blank, free, Board())
     assert nowhere.T_world_camera is None
     assert "board" in nowhere.missing
-    assumed, given = locate(blank), locate(blank, 4 * K[0, 0])
+    assumed, given = locate(blank, None, Board()), locate(blank, 4 * K[0, 0], Board())
     assert (assumed.source, given.source) == ("assumed", "given")
     assert given.intrinsics[0, 0] == K[0, 0]
     assert assumed.T_world_camera is None
     with pytest.raises(InvalidInput, check=about("focal length")):
-        locate(blank, 1.0)
+        locate(blank, 1.0, Board())
 
 
 @pytest.mark.slow
@@ -93,9 +93,9 @@ def test_a_photograph_is_straightened_by_the_camera_of_another_program(raw, tmp_
 
 def test_corners_are_in_pixels_of_the_photograph_as_it_was_sent(raw):
     expected = 4 * sighting("table.jpg", POSE.inverse()).points_px
-    assert np.abs(sight(raw, "table.jpg").points_px - expected).max() < 4 * 0.1
+    assert np.abs(sight(raw, "table.jpg", Board()).points_px - expected).max() < 4 * 0.1
     with pytest.raises(CorruptFile, check=about("wall.jpg")):
-        sight(replace(raw, encoded=np.full_like(raw.encoded, 128)), "wall.jpg")
+        sight(replace(raw, encoded=np.full_like(raw.encoded, 128)), "wall.jpg", Board())
 
 
 @pytest.mark.parametrize(
@@ -212,6 +212,7 @@ def test_photos_that_contradict_the_others_are_named():
     portrait = sighting("d.jpg", Pose(np.array([0, 0, 0.5]), np.array([0.0, 1, 0, 0])), size=(480, 640))
     for photos, name in (
         ([views[0], odd, *views[2:]], "b.jpg"),
+        ([*views, replace(sighting("e.jpg", tilted((5, 5))), board=Board(5, 4))], "e.jpg"),
         ([*views, portrait], "d.jpg"),
         ([*views, views[0]], "a.jpg"),
     ):

@@ -10,7 +10,7 @@ from osfcore.errors import InvalidInput
 from osfcore.estimation.objective import resting_orientations
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply
 from osfcore.photo.photograph import Photograph
-from osfcore.photo.pose_loss import PoseLoss, TablePrior, draw, object_windows, signed_distance, surfels_of
+from osfcore.photo.pose_loss import PoseLoss, TablePrior, draw, object_windows, print_match, signed_distance, surfels_of
 from tests.support.errors import about
 from tests.support.photographs import NAME
 
@@ -52,6 +52,18 @@ def test_the_true_pose_has_the_least_loss_at_any_exposure(surfels, taken):
     assert dark.losses[0] == pytest.approx(terms.losses[0], abs=1e-3)
     outlines = PoseLoss(object_windows([taken.photo], NAME, 60), surfels, kind="iou")
     np.testing.assert_allclose(outlines(poses), 1 - terms.iou, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("turn", "shift_m", "is_found"),
+    [((0, 0, 0), 0.0, True), ((0, 0, 0), 0.003, True), ((0, 0, np.pi), 0.0, False), ((0, np.pi, 0), 0.0, False)],
+)
+def test_the_print_is_found_in_the_right_pose_even_if_it_is_3_mm_off(surfels, taken, turn, shift_m, is_found):
+    pose = taken.pose @ Pose(np.zeros(3), quaternion_exp(np.array(turn, float)))
+    moved = Pose(pose.position + [shift_m, 0, 0], pose.quaternion)
+    match = print_match(PoseLoss(object_windows([taken.photo], NAME, 240), surfels), moved)
+    assert (match > 0.6) == is_found
+    assert 0 < match <= 1
 
 
 # Windows

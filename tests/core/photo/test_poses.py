@@ -27,6 +27,7 @@ from osfcore.photo.poses import (
     PhotoObject,
     PhotoPose,
     distinct,
+    doubt_of,
     estimate_photo,
     moved,
     poses_around,
@@ -54,7 +55,7 @@ def models(fields):
 
 
 def at(pose, name=NAME, iou=0.95):
-    return PhotoObject(name, PhotoPose(pose, 0.1, iou, 0.1, 0.9), (), "", 0.0, 0.0)
+    return PhotoObject(name, PhotoPose(pose, 0.1, iou, 0.1, 0.9, 0.8), (), "", 0.0, 0.0)
 
 
 def found_in(models, photo, name, config=None):
@@ -71,6 +72,15 @@ def test_poses_are_found_without_a_start_and_from_one_2_cm_and_15_degrees_off(mo
     assert np.linalg.norm(found.best.pose.position - taken.pose.position) < 8e-3
     assert np.rad2deg(rotation_angle(found.best.pose.quaternion, taken.pose.quaternion)) < 3
     assert is_started or found.doubt == ""
+
+
+@pytest.mark.parametrize(("matches", "is_doubted"), [((0.8, 0.4), False), ((0.5, 0.2), True), ((0.8, 0.7), True)])
+def test_of_two_orientations_that_explain_a_photo_alike_the_one_whose_print_is_found_is_trusted(
+    models, taken, matches, is_doubted
+):
+    best, rival = (PhotoPose(taken.pose, loss, 0.95, 0.3, 0.4, m) for loss, m in zip((0.5, 0.51), matches, strict=True))
+    loss = PoseLoss(object_windows([taken.photo], NAME, 60), models.surfels(NAME, FINE_ACROSS))
+    assert bool(doubt_of(NAME, best, [rival], loss)) == is_doubted
 
 
 @pytest.mark.slow

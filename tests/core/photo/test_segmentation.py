@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput
-from osfcore.photo.segmentation import propose_mask, propose_masks
+from osfcore.photo.segmentation import outline_doubt, propose_mask, propose_masks
 from tests.support.errors import about
 
 WIDTH, HEIGHT = 200, 160
@@ -149,3 +149,40 @@ def test_strokes_of_another_size_or_over_all_of_the_picture_are_refused():
         propose_mask(image, (40, 20, 90, 90), NO_CLICK, add=np.ones((5, 5), bool))
     with pytest.raises(InvalidInput, check=about("box")):
         propose_mask(image, (40, 20, 90, 90), NO_CLICK, remove=np.ones((HEIGHT, WIDTH), bool))
+
+
+def rectangle(left, top, right, bottom):
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[top:bottom, left:right] = True
+    return mask
+
+
+def test_a_pale_can_on_a_pale_table_is_more_than_its_label():
+    rng, can = np.random.default_rng(0), rectangle(70, 30, 130, 130)
+    table, body, label = (textured(rng, colour, 20.0) for colour in ((150,) * 3, (165,) * 3, (60, 60, 160)))
+    image = drawn(table, (body, can), (label, rectangle(74, 45, 126, 85)), rng=rng)
+    assert overlap(propose_mask(image, box_around(can), np.array([[100.0, 80.0]])), can) > 0.7
+
+
+def test_what_two_outlines_hold_belongs_to_the_object_in_front():
+    """Its box is filled only together with it."""
+    rng = np.random.default_rng(0)
+    table, red, blue, white = (
+        textured(rng, colour, 12.0) for colour in ((170, 165, 160), (170, 50, 50), (60, 80, 170), (240,) * 3)
+    )
+    back, can, lid = rectangle(50, 20, 150, 110), rectangle(90, 50, 140, 140), rectangle(90, 50, 140, 90)
+    image = drawn(table, (red, back), (blue, can), (white, lid), rng=rng)
+    boxes = {"back": box_around(back), "can": box_around(can)}
+    masks = propose_masks(image, boxes, {"back": np.array([[60.0, 40.0]]), "can": np.array([[115.0, 125.0]])})
+    assert overlap(masks["can"], can) > 0.95
+    assert overlap(masks["back"], back & ~can) > 0.95
+
+
+def test_an_outline_that_does_not_fill_its_box_is_doubtful():
+    box = (60.0, 20.0, 140.0, 140.0)
+    assert not outline_doubt("the can", box, rectangle(62, 24, 137, 136))
+    doubt = outline_doubt("the can", box, rectangle(70, 50, 110, 110))
+    for fact in ("the can", "50 % of its box's width", "50 % of its height"):
+        assert fact in doubt
+    cut = (60.0, 80.0, 140.0, 200.0)  # of a box that reaches out of the picture, what is in it counts
+    assert not outline_doubt("the can", cut, rectangle(62, 82, 138, HEIGHT))

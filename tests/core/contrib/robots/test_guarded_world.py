@@ -332,6 +332,15 @@ def test_boxes_become_masks_of_the_cameras_that_have_them_all(seen):
     assert OutlinedWorld(Still(seen), {}).observe(masks=True) is seen  # masks of the world come first
 
 
+def test_boxes_that_their_outlines_do_not_fill_are_doubted(seen):
+    world = OutlinedWorld(Still(replace(seen, masks=None)), boxes_around(seen, (1,), margin=25))
+    world.observe(masks=True)
+    assert world.doubts
+    assert all("in the picture of 1" in doubt for doubt in world.doubts)
+    world.observe()  # later pictures are not outlined
+    assert world.doubts
+
+
 @pytest.mark.parametrize(
     ("boxes", "error", "what"),
     [
