@@ -85,6 +85,9 @@ class EpisodeParts:
         estimators: the estimators.
         planner: factory of the planner.
         cost: factory of the cost, called for each plan; None for the cost that the episode's settings name.
+
+    Example:
+        >>> parts = EpisodeParts(cost=lambda given: PoseCost(given.goal, arm_m=0))  # rotations do not count
     """
 
     estimators: Estimators = field(default_factory=Estimators)

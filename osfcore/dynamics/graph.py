@@ -565,7 +565,7 @@ def described_sizes(metadata: Mapping[str, str], path: Path) -> tuple[int, int]:
     try:
         hidden, steps = int(metadata["hidden"]), int(metadata["steps"])
     except (KeyError, ValueError) as error:
-        raise CorruptFile(path, f"it holds no push network of a known size ({shown(error)})") from error
+        raise CorruptFile(path, f"it holds no network for pushes of a known size ({shown(error)})") from error
     if not (1 <= hidden <= _MOST_HIDDEN and 1 <= steps <= _MOST_STEPS):
         raise CorruptFile(path, f"{hidden} units and {steps} steps are out of range")
     return hidden, steps

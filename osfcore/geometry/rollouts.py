@@ -26,6 +26,11 @@ class Rollouts:
         positions: positions of the objects in the world [m].
         quaternions: orientations of the objects in the world, (w, x, y, z).
         pusher: centre of the pusher in the world [m].
+
+    Example:
+        >>> futures = push_model.rollout(state, np.zeros((2, 5, 3)))  # two sequences of five actions that wait
+        >>> futures.positions.shape, futures[0].after(3).positions.shape
+        ((2, 6, 1, 3), (1, 3, 1, 3))
     """
 
     names: tuple[str, ...]

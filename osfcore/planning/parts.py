@@ -28,6 +28,12 @@ class CostInputs:
         image: goal image, linear RGB in [0, 1].
         light: light of the goal image.
         renderer: renderer of the objects on the table, to draw futures with.
+
+    Example:
+        >>> given = CostInputs(goal, cameras[0], images[0], light, models.together)
+        >>> cost = PoseCost(given.goal)
+        >>> cost(push_model.rollout(state, np.zeros((1, 5, 3)))).round(3)  # 3 x 0.08 m
+        array([0.24])
     """
 
     goal: PoseGoal

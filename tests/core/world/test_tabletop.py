@@ -54,7 +54,7 @@ def test_given_light_leaves_the_rest_of_the_scene_alone(tables, world):
 
 def test_observation_holds_masks_on_demand_and_neither_depth_nor_poses(world):
     observation = world.observe(masks=True)
-    assert set(observation.__slots__) == {"cameras", "images", "names", "masks", "pusher", "time_s"}
+    assert set(observation.__slots__) == {"cameras", "images", "names", "masks", "pusher", "time_s", "unmasked"}
     assert observation.images.shape == (4, 48, 48, 3)
     assert observation.masks.any(axis=(2, 3)).sum() >= 10  # of 12, most objects are seen by most cameras
     assert world.observe().masks is None
