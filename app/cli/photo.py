@@ -263,7 +263,7 @@ def _summary(result: dict[str, Any]) -> Iterator[str]:
             yield f"  {entry['doubt']}"
     light = result["light"]
     if light and light["diffuse"]:
-        yield "The light is diffuse: nothing speaks for one lamp."
+        yield "The light is diffuse: the photo shows no single lamp."
     elif light:
         far = f", {light['distance_m']:.2f} m away" if light["distance_m"] is not None else ""
         yield f"Toward the lamp: {json.dumps([round(v, 2) for v in light['direction']])}{far}."

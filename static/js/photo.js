@@ -112,8 +112,8 @@ function drawResult() {
   if (doubtsOf !== photo.job?.id) byId("photo-despite").checked = false;
   doubtsOf = photo.job?.id;
   const { light } = photo;
-  byId("photo-light").textContent = !light ? "" : light.diffuse ? "The light is diffuse: nothing speaks for one lamp."
-    : !photo.table ? "There is one lamp; where it stands cannot be told without a table."
+  byId("photo-light").textContent = !light ? "" : light.diffuse ? "The light is diffuse: the photo shows no single lamp."
+    : !photo.table ? "There is one lamp; its place cannot be found without a table."
     : `Lamp ${((Math.asin(Math.min(Math.max(light.direction[2], -1), 1)) * 180) / Math.PI).toFixed(0)}° above the table, ± ${light.std_deg.toFixed(1)}°${light.distance_m === null ? "" : `, ${light.distance_m.toFixed(2)} m away`}.`;
   const choices = photo.objects.map(({ choice }) => choice ?? 0).join("-");
   setDrawing(isFound() && photo.table ? `api/${path(`/drawing.png?${new URLSearchParams({ job: photo.job.id, choices })}`)}` : "");
