@@ -50,7 +50,7 @@ def mp4_at_once(
         assert ffmpeg.stdin is not None
         pipe = ffmpeg.stdin
 
-        def put(image: UInt8[np.ndarray, "h w 3"]) -> None:
+        def put(image: np.ndarray) -> None:  # checked by hand: a wrong one would shift all that follow
             if image.shape != (height, width, 3) or image.dtype != np.uint8:
                 is_now = f"{image.dtype} {image.shape}"
                 raise InvalidInput("image of a video", is_now, f"uint8 {(height, width, 3)}")

@@ -33,9 +33,13 @@ NUMBERS = {
     "robot-steps": ["RobotSettingsIn.steps"],
     "size": ["CollectObjectParams.size", "CollectTableParams.size"],
 }  # fmt: skip
-QUERIES = {"grams": ("/api/objects", "mass_kg", 1000), "label": ("/api/objects", "label", 1)}
+QUERIES = {
+    "grams": ("/api/objects", "mass_kg", 1000),
+    "label": ("/api/objects", "label", 1),
+    "calibration-board": ("/api/calibration/photos", "board", 1),
+}
 NUMBERS_AS_TEXT = ("box",)  # taken apart by the page
-TEXTS = {"draft-name": "DraftKeep.name", "name": "TrainFieldParams.name"}
+TEXTS = {"draft-name": "DraftKeep.name", "name": "TrainFieldParams.name", "board": "PhotoPatch.board"}
 
 
 def source(name):
@@ -98,16 +102,14 @@ def test_every_number_that_can_be_entered_has_the_bounds_that_rest_states():
 
 def test_every_text_that_can_be_entered_is_as_long_as_rest_allows():
     texts = Inputs().of_type("text")
-    assert {entry.get("name") or entry["id"] for entry in texts} == {*TEXTS, *NUMBERS_AS_TEXT, "label"}
-    for entry in texts:
-        if entry.get("name") in QUERIES:
-            path, parameter, _ = QUERIES[entry["name"]]
+    named = [(entry.get("name") or entry["id"], entry) for entry in texts]
+    assert {name for name, _ in named} == {*TEXTS, *NUMBERS_AS_TEXT, "label", "calibration-board"}
+    for name, entry in named:
+        if name in QUERIES:
+            path, parameter, _ = QUERIES[name]
             assert int(entry["maxlength"]) == query_of("post", path, parameter)["maxLength"]
-            continue
-        if entry.get("name") in NUMBERS_AS_TEXT:
-            continue
-        place = TEXTS[entry.get("name") or entry["id"]]
-        assert int(entry["maxlength"]) == property_of(place)["maxLength"], place
+        elif name not in NUMBERS_AS_TEXT:
+            assert int(entry["maxlength"]) == property_of(TEXTS[name])["maxLength"], name
 
 
 def test_what_scripts_cut_off_or_count_is_what_rest_states():

@@ -61,7 +61,7 @@ def test_an_object_is_found_by_its_box(taken, photo, tmp_path, capsys):
     assert result["table"] is None  # one object does not tell
     assert any("No printed board was found" in note for note in result["notes"])
     assert result["light"]["distance_m"] is None
-    assert any("How far away the lamp is" in note for note in result["notes"])
+    assert any("distance of the lamp" in note for note in result["notes"])
     assert (images / f"{NAME}.png").stat().st_size > 1000
 
 

@@ -86,7 +86,7 @@ def test_a_photograph_is_straightened_by_the_camera_of_another_program(raw, tmp_
         f"camera_matrix: {{rows: 3, cols: 3, data: {sent.ravel().tolist()}}}\n"
         f"distortion_coefficients: {{rows: 1, cols: 5, data: [{RADIAL}, 0, 0, 0, 0]}}\n"
     )
-    located = locate_calibrated(raw, read_camera(tmp_path / "camera_info.yaml"))
+    located = locate_calibrated(raw, read_camera(tmp_path / "camera_info.yaml"), Board())
     np.testing.assert_allclose(located.T_world_camera.matrix(), POSE.matrix(), atol=2e-3)
     np.testing.assert_allclose(located.intrinsics, K, atol=1e-9)
 
