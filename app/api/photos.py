@@ -124,7 +124,7 @@ class PhotoPatch(Input):
 
     focal_px: Focal | None
     camera: CameraIn | None = Field(None, description="`camera` of a calibration.")
-    board: BoardText | None = Field(None, description=f"{_BOARD} Null for the one that was told before.")
+    board: BoardText | None = Field(None, description=f"{_BOARD} Null keeps the present one.")
 
 
 class FindIn(Input):

@@ -140,7 +140,7 @@ class TablePhotos(TablePhotoStore):
             photo: identifier.
             focal_px: focal length; None for what board or file give.
             camera: that took it; the focal length does not count then.
-            board: that may be in view, as `board_of` reads it; None for the one that was told before.
+            board: that may be in view, as `board_of` reads it; None keeps the present one.
 
         Raises:
             UnknownName: if there is none.

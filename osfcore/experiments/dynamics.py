@@ -633,7 +633,7 @@ def evaluate_dynamics(
     check_run(config.tasks, config.seed)
     if config.method not in METHODS:
         raise InvalidInput("method", repr(config.method), f"one of {', '.join(METHODS)}")
-    names = tuple(sorted(chosen_objects(config.names, fields, assets)))
+    names = chosen_objects(config.names, fields, assets)
     if len(names) < min(COUNTS) + 1:
         raise InvalidInput("number of objects with a field and a mesh", len(names), f"at least {min(COUNTS) + 1}")
     # Objects that the second shipped network has not seen, as far as they are there; the paper's has none.

@@ -86,7 +86,9 @@ def measurable(fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
 
 
 def chosen_objects(names: Iterable[str] | None, fields: FieldLibrary, assets: AssetLibrary) -> tuple[str, ...]:
-    """Return the objects to draw from: those named, each once and in this order, or all measurable ones if None.
+    """Return the objects to draw from, sorted: those named, or all measurable ones if None.
+
+    Tasks depend on the order, and kept results do not know it.
 
     Raises:
         UnknownName: if a named object has no field.
@@ -95,7 +97,7 @@ def chosen_objects(names: Iterable[str] | None, fields: FieldLibrary, assets: As
     """
     if names is None:
         return measurable(fields, assets)
-    chosen = tuple(dict.fromkeys(names))
+    chosen = tuple(sorted(set(names)))
     for name in chosen:
         fields.info(name)  # raises UnknownName
     missing = [name for name in chosen if not assets.has(name)]

@@ -39,6 +39,7 @@ MAX_UNPACKED_BYTES = 1 << 30
 MAX_FILES = 1000
 _GLB_MAGIC, _ZIP_MAGIC = b"glTF", b"PK"
 _RANKS = ((".obj", ".glb", ".gltf"), (".ply",), (".stl", ".off"))  # scans come with copies that have fewer colours
+MESH_SUFFIXES = tuple(suffix for rank in _RANKS for suffix in rank)
 _EXPECTED = "a GLB, PLY or STL, or a zip of an OBJ with its MTL and texture"
 _ZIP = ".zip"
 
@@ -61,7 +62,7 @@ def check_upload(file: Path, name: str) -> str:
         check_zip(file, MAX_FILES)
         return _ZIP
     suffix = PurePath(name).suffix.lower()
-    if suffix == ".glb" or not any(suffix in suffixes for suffixes in _RANKS):
+    if suffix == ".glb" or suffix not in MESH_SUFFIXES:
         raise CorruptFile(file, f"it is no mesh that can be read; send {_EXPECTED}")
     return suffix
 
@@ -282,7 +283,6 @@ def resting_poses(parts: tuple[Float[np.ndarray, "_ 3"], ...]) -> RestingPoses:
 
 MIN_LENGTH_M, MAX_LENGTH_M = 0.005, 1.0
 MAX_FACES = 200_000
-MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
 _GLTF_SUFFIXES = (".glb", ".gltf")
 _CREASE_RAD = np.deg2rad(50.0)  # edges sharper than this stay sharp: a box must not shade like a pillow
 _MIN_THICKNESS = 1e-3  # of the longest side; thinner is a sheet, which no solver can rest on a table

@@ -631,16 +631,16 @@ def _continued(board: Board, corners: Quads, found: FoundPoints) -> bool:
 
 
 def _another(board: Board, seen: SeenPrint | None) -> InvalidInput:
-    """Return the error of a photograph that shows another board than the one that was told."""
+    """Return the error of a photograph that shows another board than the expected one."""
     legacy = " in the legacy pattern" if board.legacy else ""
-    told = f"the one that was told, {board.columns} x {board.rows} squares with markers of {board.dictionary}{legacy}"
+    expected = f"the expected one, {board.columns} x {board.rows} squares with markers of {board.dictionary}{legacy}"
     if seen is None:
-        return InvalidInput("board in the photograph", "another one", f"{told}, or described: {BOARD_FORM}")
+        return InvalidInput("board in the photograph", "another one", f"{expected}, or described: {BOARD_FORM}")
     given = f"another one, {seen.words()}"
     if not seen.is_charuco:
-        return InvalidInput("board in the photograph", given, f"a ChArUco board, chessboard and markers: {told}")
+        return InvalidInput("board in the photograph", given, f"a ChArUco board, chessboard and markers: {expected}")
     described = f"described as {seen.form()}, with the sides in metres; its markers have {seen.marker:.2f} of a square"
-    return InvalidInput("board in the photograph", given, f"{told}, or {described}")
+    return InvalidInput("board in the photograph", given, f"{expected}, or {described}")
 
 
 def _not_found(grey: Grey, board: Board, corners: int) -> InvalidInput:
@@ -672,7 +672,7 @@ def _blur_px(grey: Grey) -> float:
     return float(np.sqrt(max(((high - low) / steepest) ** 2 / (2 * np.pi) - 1, 0)))
 
 
-# Which print of markers a photograph shows, where it is not the board that was told.
+# Which print of markers a photograph shows, where it is not the expected board.
 #
 # Markers of every dictionary are looked for. Their numbers run along the rows, so that the number of columns says in
 # which square each marker lies: in every second one of a chessboard, in every one of a grid. Of all numbers of columns

@@ -62,7 +62,7 @@ def test_all_methods_know_the_objects_that_are_drawn(library, tmp_path):
         assert set(SOLIDS) <= set(names) <= set(library.names())
         assert all(field_path(method, name, fields, tmp_path).is_file() for name in names for method in methods)
     again = (SOLIDS[1], SOLIDS[0], SOLIDS[1])
-    assert common_names(FIELD_METHODS, again, fields, library, tmp_path, 2) == again[:2]
+    assert common_names(FIELD_METHODS, again, fields, library, tmp_path, 2) == SOLIDS[:2]
 
 
 @pytest.mark.parametrize(
