@@ -64,7 +64,7 @@ def colour_of(shares: Iterable[float]) -> Colour:
 
 # Shares of half the view that stay free: left and right, below (where the page's own buttons are) and above (labels).
 _FREE_SIDES, _FREE_BELOW, _FREE_ABOVE = 0.06, 0.2, 0.16
-_NEAREST_M = 0.6
+_NEAREST_M, _NEAREST_POINT_M = 0.6, 0.1  # before the camera: the points on average, and each of them
 
 
 def framing(
@@ -73,8 +73,9 @@ def framing(
     """Place a camera as near as it can be while all points are in view.
 
     With x, y, z along the camera's right, up and forward axes and the camera at (a, b, -d), a point is in view if
-    -l (z + d) <= x - a <= r (z + d), and likewise for y. Both sides together bound d from below; the largest bound
-    wins, and the points are put in the middle of what the other axis leaves free.
+    -l (z + d) <= x - a <= r (z + d), and likewise for y. Both sides together bound d from below, as do the least
+    distances of the points. The largest bound wins, and the points are put in the middle of what the other axis leaves
+    free.
 
     Args:
         points_m: to be seen, in the world [m].
@@ -93,7 +94,8 @@ def framing(
     ]
     depth = points_m @ forward
     bounds = [((-at - low * depth).max(), (at - high * depth).max(), low, high) for at, low, high in sides]
-    back = max(_NEAREST_M - depth.mean(), *((below + above) / (low + high) for below, above, low, high in bounds))
+    least = _NEAREST_M - depth.mean(), _NEAREST_POINT_M - depth.min()
+    back = max(*least, *((below + above) / (low + high) for below, above, low, high in bounds))
     a, b = ((above - high * back + low * back - below) / 2 for below, above, low, high in bounds)
     position = a * right + b * up - back * forward
     return position, position + (back + depth.mean()) * forward
