@@ -31,13 +31,18 @@ export async function problemOf(answer) {
   }
 }
 
+let underway = 0; // calls that have not been answered yet
+
 async function call(method, path, body) {
   let answer;
+  underway += 1;
   try {
     const headers = body === undefined ? SIGNED : { ...SIGNED, "Content-Type": "application/json" };
     answer = await fetch(`api/${path}`, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
   } catch {
     throw new ApiError("The service cannot be reached.", 0);
+  } finally {
+    underway -= 1;
   }
   if (answer.status === 404) throw new ApiError("It is not there any more; somebody has deleted it.", 404);
   if (!answer.ok) throw new ApiError(await problemOf(answer), answer.status);
@@ -60,6 +65,13 @@ export function upload(path, file, onProgress = () => {}, type = "application/zi
     });
     request.send(file);
   });
+}
+
+const QUIET_MS = 60;
+
+/** Resolves once the service has answered all calls and nothing more is asked of it for a moment. */
+export async function allAnswered() {
+  for (let quiet = 0; quiet < 2; quiet = underway ? 0 : quiet + 1) await new Promise((resolve) => setTimeout(resolve, QUIET_MS));
 }
 
 export const get = (path) => call("GET", path);

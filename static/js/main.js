@@ -1,6 +1,6 @@
 // Puts the page together: sets the pieces up, follows the event stream, keeps the status line honest.
 import { setUpAddress } from "./address.js";
-import { VISITOR, get } from "./api.js";
+import { VISITOR, allAnswered, get } from "./api.js";
 import { setUpBeside } from "./beside.js";
 import { setUpCalibrate } from "./calibrate.js";
 import { setUpCameras, showFrames } from "./cameras.js";
@@ -130,6 +130,12 @@ refreshGoals();
 refreshPhotos();
 refreshDamaged();
 
+/** The panel comes when it is known what belongs there, so that nothing moves under the pointer. */
+async function showPanel() {
+  await allAnswered();
+  byId("panel").classList.remove("unknown");
+}
+
 listen(VISITOR, {
   open(again) {
     settleUnreachable();
@@ -152,10 +158,14 @@ listen(VISITOR, {
     }
   },
   lost() {
+    showPanel();
     status("Reconnecting", "lost");
     hearStream(false);
   },
-  scene: (scene) => set("scene", scene),
+  scene(scene) {
+    set("scene", scene);
+    showPanel();
+  },
   frame: showFrames,
   job(job) {
     showJob(job);

@@ -32,7 +32,8 @@ function row(one) {
 
 function draw() {
   const push = known("push");
-  byId("push-bar").hidden = !current() || known("recorded") || LIVE.has(known("episode")?.state);
+  const isRecorded = known("recorded") || !byId("story-foot").hidden; // or will be
+  byId("push-bar").hidden = !current() || isRecorded || LIVE.has(known("episode")?.state);
   byId("push-told").textContent = told(push);
   byId("push-execute").hidden = push?.state !== "predicted";
   byId("push-clear").hidden = !push;

@@ -189,5 +189,6 @@ export async function setUpStory() {
     isOn = false;
     show(false);
     byId("timeline-bar").hidden = !timeline.source;
+    set("recorded", known("recorded")); // for what made room for the story
   }
 }

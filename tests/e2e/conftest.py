@@ -66,3 +66,12 @@ def browser():
         browser.new_page = partial(page_of_someone_who_knows, browser.new_page)
         yield browser
         browser.close()
+
+
+@pytest.fixture(autouse=True)
+def no_page_stays(browser):
+    """Close what a test leaves open, also one that fails: while that page drives, all others only watch."""
+    before = [page for context in browser.contexts for page in context.pages]
+    yield
+    for page in (page for context in browser.contexts for page in context.pages if page not in before):
+        page.close()

@@ -103,8 +103,8 @@ def test_the_page_stands_still_while_it_loads(browser, service, size):
     page.goto(service.url)
     for awaited in ("#story-foot:not([hidden])", '#status[data-state="live"]', "#preset-list li", "#story-key li"):
         page.wait_for_selector(awaited, timeout=WAIT_MS)
+    page.wait_for_selector("#tab-try", timeout=WAIT_MS)
     assert page.evaluate("shift") < 0.05
-    page.close()
 
 
 def test_page_loads_without_errors_or_foreign_requests(page, service):
