@@ -130,11 +130,11 @@ refreshGoals();
 refreshPhotos();
 refreshDamaged();
 
-/** The panel comes when it is known what belongs there, so that nothing moves under the pointer. */
-async function showPanel() {
-  await allAnswered();
-  byId("panel").classList.remove("unknown");
-}
+const showPanel = () => byId("panel").classList.remove("unknown");
+
+/** The panel comes when it is known what belongs there, so that nothing moves under the pointer; or with a first click. */
+const showKnownPanel = () => allAnswered().then(showPanel);
+document.addEventListener("click", showPanel, { capture: true, once: true });
 
 listen(VISITOR, {
   open(again) {
@@ -158,13 +158,13 @@ listen(VISITOR, {
     }
   },
   lost() {
-    showPanel();
+    showKnownPanel();
     status("Reconnecting", "lost");
     hearStream(false);
   },
   scene(scene) {
     set("scene", scene);
-    showPanel();
+    showKnownPanel();
   },
   frame: showFrames,
   job(job) {
