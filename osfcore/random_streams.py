@@ -51,6 +51,7 @@ class Stream(IntEnum):
     PAPER_SCENE = 94  # scenes whose poses and light are estimated as published, under choices that its text leaves open
     UNROLLED_SCENE = 96  # scenes whose estimates are shown step by step
     SAMPLE_WOOD = 97  # of the table in the sample photograph
+    DRAWN_PHOTO = 98  # tables in drawn photographs, their cameras, and what those do to a picture
     LAMP_SCENE = 95  # scenes under lamps that are estimated, and the photographs of them
 
 

@@ -395,12 +395,14 @@ class EvaluateVideoCommand(ParallelEvaluation):
 
 @dataclass(frozen=True)
 class EvaluatePhotosCommand(DataCommand):
-    """Real photographs: objects by their masks, without a start or from poses of another program; lamps."""
+    """Photographs: objects by boxes or masks, without a start or from poses of another program; lamps."""
 
     data: Path | None = None
     """Folder of folders with photo.json, or of chrome balls under lamps."""
     lamps: Literal["photographed", "simulated"] = "photographed"
     """simulated: near lamps over simulated tables instead, without data."""
+    drawn: int = 0
+    """Photographs to draw of simulated tables, cluttered and as phones store them, and to measure instead of --data."""
     tasks: int = 20
     """Simulated scenes with a near lamp; a fourth as many have a distant one."""
     views: int = 1
@@ -416,13 +418,14 @@ class EvaluatePhotosCommand(DataCommand):
     repeats: int = 1
     """Random starts of each object."""
     loss: Literal["all", "iou"] = "all"
-    """Outline, shading and texture; the outline alone, as in the paper."""
+    """Colours, print and outline; the outline alone, as in the paper."""
     out: Path | None = None
     """Folder for report.json and contact sheets; DATA_DIR/photos by default."""
     seed: Seed = 0
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds what report.json does."""
+        from osfcore.experiments.drawn_photos import write_drawn_photos
         from osfcore.experiments.lamps import EvaluateLamps, evaluate_lamps
         from osfcore.experiments.photos import EvaluatePhotos, evaluate_photos
 
@@ -432,10 +435,14 @@ class EvaluatePhotosCommand(DataCommand):
             report = report_of(evaluate_lamps(config, self.assets, self.trained))
             self.say(*_lamps_of(report), f"Figures: {folder}")
             return report
-        if self.data is None:
-            raise InvalidInput("data", "missing", "a folder of photographs, or --lamps simulated, which needs none")
-        folder = self.out or self.data_dir / "photos"
-        config = EvaluatePhotos(folder, self.data, self.start, self.plane, self.mask_error, self.repeats, self.loss,
+        folder, data = self.out or self.data_dir / "photos", self.data
+        if self.drawn:
+            data = folder / "drawn"
+            write_drawn_photos(self.assets, data, self.seed, self.drawn)
+        if data is None:
+            allowed = "a folder of photographs, or --drawn or --lamps simulated, which need none"
+            raise InvalidInput("data", "missing", allowed)
+        config = EvaluatePhotos(folder, data, self.start, self.plane, self.mask_error, self.repeats, self.loss,
                                 self.seed, self.masks)  # fmt: skip
         report = report_of(evaluate_photos(config, self.trained))
         self.say(*_photos_of(report), f"Pictures and figures: {folder}")
