@@ -134,7 +134,7 @@ class PhotoEstimate(DataCommand):
         rng = stream_rng(self.seed, Stream.PHOTO_SEARCH)
         config = PhotoConfig(starts, focal_known=focal_known)
         last = last_of(estimate_photo(models, photos, names, rng, config))
-        photos = tuple(map(last.as_seen, photos))
+        photos = tuple(last.as_seen(photo, number) for number, photo in enumerate(photos))
         result = encode(summarised(photos, last, models, notes, board_of(self.board)))
         write_json(self.out, result)
         if self.images is not None:
@@ -169,24 +169,24 @@ class PhotoEstimate(DataCommand):
                 raise UnknownName("object", name, known)
             boxes[number][name] = box
         masks = [self._masks(known, raw, boxes[number], number) for number, raw in enumerate(raws)]
-        image, marked = self.image_id[0] if self.image_id else None, tuple({name for its in masks for name in its})
-        choice = PoseChoice(image, self.scene_id, self.pose_source, self.pose_frame, marked)
+        image, names = self.image_id[0] if self.image_id else None, {name for its in masks for name in its}
+        choice = PoseChoice(image, self.scene_id, self.pose_source, self.pose_frame, tuple(names))
         poses = {} if self.poses is None else read_poses(self.poses, choice)
         outlines = zip(boxes, masks, strict=True)
         doubts = [outline_doubt(n, box, found[n]) for its, found in outlines for n, box in its.items()]
         photos, notes, focal_known = [], [doubt for doubt in doubts if doubt], True
         if notes:  # the search takes long
             self.say(*notes)
-        for path, raw, its in zip(self.photo, raws, masks, strict=True):
+        for path, raw, its, marked in zip(self.photo, raws, masks, boxes, strict=True):
             found = locate(raw, self.focal, board) if camera is None else locate_calibrated(raw, camera, board)
             if found.T_world_camera is None and len(raws) > 1:
                 allowed = f"to be seen, since there are several photos ({found.missing.rstrip('.')})"
                 raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed)
             straight = {name: found.straightened(mask) for name, mask in its.items()}
-            photos.append(to_photograph(found.raw, found.intrinsics, found.T_world_camera, straight))
+            photo = to_photograph(found.raw, found.intrinsics, found.T_world_camera, straight)
+            photos.append(photo.with_masks(straight, {name: found.straight_box(box) for name, box in marked.items()}))
             focal_known = focal_known and found.source != "assumed"
             notes += found.notes if len(raws) == 1 else [f"{path.name}: {note}" for note in found.notes]
-        names = {name for its in masks for name in its}
         starts = {name: photos[0].T_world_camera @ pose for name, pose in poses.items() if name in names}
         if self.poses is not None:
             unused, missing = (", ".join(sorted(found)) for found in (set(poses) - names, names - set(poses)))

@@ -344,7 +344,8 @@ def _is_same(one: TablePhoto, other: TablePhoto) -> bool:
 def _order(photo: TablePhoto) -> PhotoInput:
     T = None if photo.T_world_camera is None else photo.T_world_camera.matrix().tolist()
     names, focal_known = [entry.name for entry in photo.objects], photo.source != "assumed"
-    return PhotoInput(K=photo.K.tolist(), T_world_camera=T, names=names, focal_known=focal_known)
+    boxes = {entry.name: list(entry.mark.box) for entry in photo.objects if not entry.mark.strokes}
+    return PhotoInput(K=photo.K.tolist(), T_world_camera=T, names=names, focal_known=focal_known, boxes=boxes)
 
 
 # What becomes of a photographed table: a table of the simulation, or a goal of one; and how it looks when drawn

@@ -209,7 +209,9 @@ class PhotoScore:
         position_mm: distance from the reference; None without one.
         rotation_deg: angle to it, symmetries counted.
         doubt: why the pose should not be trusted; "" where it may be.
-        ratio: loss of the best other orientation over that of the pose.
+        margin: by how much the best other orientation scores worse; None if there is no other.
+        explained: mean log odds that pixels show the object.
+        match: share of its print that is found again.
         coarse_s: of the search over rotations.
         refine_s: of the refinement.
         mask_iou: of the mask that was searched with and the given one.
@@ -224,7 +226,9 @@ class PhotoScore:
     position_mm: float | None
     rotation_deg: float | None
     doubt: str
-    ratio: float
+    margin: float | None
+    explained: float
+    match: float
     coarse_s: float
     refine_s: float
     mask_iou: float = 1.0
@@ -423,7 +427,7 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ev
         for found in last.found:
             moved = replace(found, best=replace(found.best, pose=photo.T_world_camera.inverse() @ found.best.pose))
             write_sheet(config.folder / f"{scene.name}-{found.name}-{number}.png", models, scene.photo, moved)
-            used, given = photo.masks[found.name], scene.photo.masks[found.name]
+            used, given = last.as_seen(photo).masks[found.name], scene.photo.masks[found.name]
             mask_iou = float((used & given).sum() / (used | given).sum())
             fills_box = not outline_doubt(found.name, box_and_click(given)[0], used)
             scores.append(replace(_score(renderer, scene, moved), mask_iou=mask_iou, fills_box=fills_box))
@@ -461,7 +465,7 @@ def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject) -> P
     position_mm = rotation_deg = None
     if (reference := scene.reference.get(name)) is not None:
         position_mm, rotation_deg = pose_error(CATALOGUE[name].symmetry, pose, reference)
-    ratio = found.rivals[0].loss / max(found.best.loss, 1e-9) if found.rivals else np.inf
+    margin = found.rivals[0].score - found.best.score if found.rivals else None
     return PhotoScore(
         scene=scene.name,
         name=name,
@@ -471,7 +475,9 @@ def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject) -> P
         position_mm=position_mm,
         rotation_deg=rotation_deg,
         doubt=found.doubt,
-        ratio=min(ratio, 99.0),
+        margin=margin,
+        explained=found.best.explained,
+        match=found.best.match,
         coarse_s=found.coarse_s,
         refine_s=found.refine_s,
     )
@@ -484,7 +490,7 @@ def _photo(config: EvaluatePhotos, scene: PhotoFolder) -> Photograph:
         marks = {name: box_and_click(mask) for name, mask in photo.masks.items()}
         boxes = {name: box for name, (box, _) in marks.items()}
         clicks = {name: click for name, (_, click) in marks.items()}
-        photo = photo.with_masks(propose_masks(np.ascontiguousarray(encoded), boxes, clicks))
+        photo = photo.with_masks(propose_masks(np.ascontiguousarray(encoded), boxes, clicks), boxes)
     if config.mask_error_px:
         kernel = np.ones((2 * config.mask_error_px + 1,) * 2, np.uint8)
         change = (cv2.dilate, cv2.erode)

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Shaped
+from jaxtyping import Bool, Float, Float32, Shaped
 
 from osfcore.errors import InvalidInput, shown
 from osfcore.geometry.poses import Pose
 from osfcore.photo.board import Intrinsics, checked_intrinsics
 
 Masks = Mapping[str, Bool[np.ndarray, "h w"]]  # by name of the object
+Box = tuple[float, float, float, float]  # left, top, right, bottom [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,11 @@ class WindowFrame:
         scale = [[self.width / (self.right - self.left)], [self.height / (self.bottom - self.top)], [1.0]]
         return moved * np.array(scale)
 
+    def points(self, pixels: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
+        """Return positions in the photograph as positions in the window [px]."""
+        per_px = np.array([self.width, self.height]) / (self.right - self.left, self.bottom - self.top)
+        return (pixels - (self.left, self.top)) * per_px
+
     def placed(self, share: Float32[np.ndarray, "a b"], shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
         """Return the pixels of the whole photograph of which a window marks more than half."""
         whole = cv2.resize(share, (self.right - self.left, self.bottom - self.top)) > 0.5
@@ -68,6 +74,7 @@ class Photograph:
         T_world_camera: pose of the camera in the world, OpenCV axes.
         on_table: whether the world's z = 0 is the table's plane; if not, the world is the camera's own frame.
         masks: pixels that show an object, by its name.
+        boxes: drawn around objects whose masks are no more than proposals, by name; masks of others are trusted.
     """
 
     image: Float32[np.ndarray, "h w 3"]
@@ -76,6 +83,7 @@ class Photograph:
     T_world_camera: Pose
     on_table: bool
     masks: Masks = field(default_factory=dict)
+    boxes: Mapping[str, Box] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and numbers."""
@@ -108,13 +116,17 @@ class Photograph:
         """Width of the image [px]."""
         return self.image.shape[1]
 
-    def with_masks(self, masks: Masks) -> Photograph:
+    def with_masks(self, masks: Masks, boxes: Mapping[str, Box] | None = None) -> Photograph:
         """Return the same photograph with other masks.
+
+        Args:
+            masks: by name.
+            boxes: around objects whose masks are no more than proposals; None leaves them as they are.
 
         Raises:
             InvalidInput: if a mask has another size than the image, or is empty.
         """
-        return replace(self, masks=dict(masks))
+        return replace(self, masks=dict(masks), boxes=self.boxes if boxes is None else dict(boxes))
 
     def resized(self, longest: int) -> Photograph:
         """Return the same view with fewer pixels. A small photograph is not changed.
@@ -134,14 +146,23 @@ class Photograph:
         if scale >= 1:
             return self
         size = max(round(self.width * scale), 1), max(round(self.height * scale), 1)
-        per_axis = np.array([[size[0] / self.width], [size[1] / self.height], [1.0]])
+        scale_x, scale_y = size[0] / self.width, size[1] / self.height
+        per_axis = np.array([[scale_x], [scale_y], [1.0]])
         masks = {name: _averaged(mask, size) > 0.5 for name, mask in self.masks.items()}
         for name, mask in masks.items():
             if not mask.any():
                 allowed = f"larger, since nothing of {shown(name)} would be left"
                 raise InvalidInput("longest side of the photo [px]", longest, allowed)
         image, exposed = np.clip(_averaged(self.image, size), 0, 1), _averaged(~self.well_exposed, size) == 0
-        return replace(self, image=image, well_exposed=exposed, intrinsics=self.intrinsics * per_axis, masks=masks)
+        boxes = {n: (a * scale_x, b * scale_y, c * scale_x, d * scale_y) for n, (a, b, c, d) in self.boxes.items()}
+        K = self.intrinsics * per_axis
+        return replace(self, image=image, well_exposed=exposed, intrinsics=K, masks=masks, boxes=boxes)
+
+
+def mask_box(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "4"]:
+    """Return the box of a mask: left, top, right, bottom [px]."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return np.array([columns[0], rows[0], columns[-1] + 1.0, rows[-1] + 1.0])
 
 
 def _averaged(image: np.ndarray, size: tuple[int, int]) -> Float32[np.ndarray, "h w *c"]:

@@ -1,4 +1,4 @@
-"""The loss of an object's pose in photographs: outline, shading and texture, compared by surfels."""
+"""The loss of an object's pose in photographs: which pixels it explains better than what surrounds it, and print."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int32
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial import KDTree
 
 from osfcore.errors import InvalidInput
@@ -29,7 +29,7 @@ from osfcore.geometry.poses import (
     quaternion_to_matrix,
     rotate,
 )
-from osfcore.photo.photograph import Photograph, WindowFrame
+from osfcore.photo.photograph import Photograph, WindowFrame, mask_box
 
 # Compiled comparison of an object's surfels in many poses with one photograph.
 
@@ -38,7 +38,12 @@ from osfcore.photo.photograph import Photograph, WindowFrame
 
 
 _NOTHING = -1
-_TERMS = 4  # of what `compare_poses` writes: IoU, relative residual, correlation, share of the mask that was compared
+_TERMS = 4  # of what `compare_poses` writes: IoU, what is explained, correlation, misfit of the box
+_FEWEST_COMPARED = 12  # pixels
+_NARROW, _WIDE, _WIDE_SHARE = 0.08, 0.35, 0.25  # the two parts of the error of a drawn colour, see `compare_poses`
+_MOST_LOG_ODDS = 3.0  # of one pixel
+_REWEIGHTED = 2  # fits of the light
+_BOX_STD, _FARTHEST_STD = 0.04, 4.0  # of a side, per side of the box; beyond, a side counts no more
 _LIGHTS = 4  # ambient and first-order harmonics
 _NEAREST_M = np.float32(0.02)
 _OPTIONS = {"fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
@@ -104,42 +109,46 @@ def draw_surfels(points, normals, half, r, t, lens, nearest, index) -> None:
 
 
 @numba.njit(**_OPTIONS)
-def _fit_light(albedo, normals, r, index, compared, image, fitted) -> float:
-    """Least squares of I = albedo * (a + b . n) for each colour on compared pixels; returns the squared residual."""
+def _fit_light(albedo, normals, r, index, compared, image, light) -> None:
+    """Least squares of I = albedo * (a + b . n) for each colour on compared pixels, reweighted by Cauchy's function.
+
+    Shadows, highlights and what hides the object are outliers. `light` is 3 x 4, the result.
+    """
     where = np.argwhere(compared)
     count = len(where)
-    basis = np.ones((count, _LIGHTS))
+    basis, weights, errors = np.ones((count, _LIGHTS)), np.ones(count), np.empty(count)
     for k in range(count):
         s = index[where[k, 0], where[k, 1]]
         for c in range(3):
             basis[k, c + 1] = r[c, 0] * normals[s, 0] + r[c, 1] * normals[s, 1] + r[c, 2] * normals[s, 2]
-    fitted[:] = 0
-    residual = 0.0
     normal, right = np.zeros((_LIGHTS, _LIGHTS)), np.zeros(_LIGHTS)
-    for colour in range(3):
-        normal[:], right[:] = 0.0, 0.0
-        for k in range(count):
-            a = albedo[index[where[k, 0], where[k, 1]], colour]
-            y = image[where[k, 0], where[k, 1], colour]
+    for _ in range(_REWEIGHTED):
+        errors[:] = 0.0
+        for colour in range(3):
+            normal[:], right[:] = 0.0, 0.0
+            for k in range(count):
+                a = albedo[index[where[k, 0], where[k, 1]], colour]
+                y = image[where[k, 0], where[k, 1], colour]
+                for i in range(_LIGHTS):
+                    right[i] += weights[k] * a * basis[k, i] * y
+                    for j in range(i + 1):
+                        normal[i, j] += weights[k] * a * a * basis[k, i] * basis[k, j]
+            whole = normal[0, 0] + 1e-6
             for i in range(_LIGHTS):
-                right[i] += a * basis[k, i] * y
-                for j in range(i + 1):
-                    normal[i, j] += a * a * basis[k, i] * basis[k, j]
-        whole = normal[0, 0] + 1e-6
-        for i in range(_LIGHTS):
-            for j in range(i):
-                normal[j, i] = normal[i, j]
-            normal[i, i] += (_HARMONIC_RIDGE if i else _AMBIENT_RIDGE) * whole
-        light = np.linalg.solve(normal, right)
+                for j in range(i):
+                    normal[j, i] = normal[i, j]
+                normal[i, i] += (_HARMONIC_RIDGE if i else _AMBIENT_RIDGE) * whole
+            light[colour] = np.linalg.solve(normal, right)
+            for k in range(count):
+                value = 0.0
+                for i in range(_LIGHTS):
+                    value += light[colour, i] * basis[k, i]
+                value *= albedo[index[where[k, 0], where[k, 1]], colour]
+                root = np.sqrt(max(value, 0.0)) - np.sqrt(image[where[k, 0], where[k, 1], colour])
+                errors[k] += root * root
+        scale = 2 * np.median(errors) + 1e-6
         for k in range(count):
-            row, column = where[k, 0], where[k, 1]
-            value = 0.0
-            for i in range(_LIGHTS):
-                value += light[i] * basis[k, i]
-            value *= albedo[index[row, column], colour]
-            residual += (value - image[row, column, colour]) ** 2
-            fitted[row, column] += value / 3
-    return residual
+            weights[k] = 1 / (1 + errors[k] / scale)
 
 
 @numba.njit(**_OPTIONS)
@@ -197,49 +206,79 @@ def _correlation(fitted, luminance, compared, tables) -> float:
 
 @numba.njit(parallel=True, **_OPTIONS)
 def compare_poses(
-    points, normals, albedo, half, rotations, positions, lens, image, luminance, mask, known, plain, terms
-) -> None:
+    points, normals, albedo, half, rotations, positions, lens, image, luminance, mask, known, usable, evidence, level,
+    box, terms,
+) -> None:  # fmt: skip
     """Compare B poses with one window of a photograph.
+
+    A drawn pixel counts the log odds of its colour I under the object drawn there, I', and under what is around it,
+
+        g = log (0.75 N(e; 0.08) + 0.25 N(e; 0.35)) + evidence,   e = (sqrt(I') - sqrt(I)) / level,
+
+    clipped to +-3; N is the normal density over three colours, and `evidence` has the rest (see `ObjectWindow`).
 
     Args:
         points, normals, albedo, half: surfels, see `draw_surfels`.
         rotations, positions: B x 3 x 3 and B x 3, from the object's frame to the camera's.
         lens: lens of the window.
         image, luminance: linear radiance, h x w x 3, and its mean over colours.
-        mask, known, plain: pixels of the object; pixels where that is known; well exposed pixels within the mask.
-        terms: B x 4, results.
+        mask, known, usable: pixels of the object; pixels where that is known; those of them that are well exposed.
+        evidence, level, box: see `ObjectWindow`.
+        terms: B x 4, results: IoU; sum of g per pixel of the box; correlation of the band-passed images; distance
+            of the drawn outline's sides from those of the box, the mean of four [0.04 of a side].
     """
     height, width = mask.shape
+    across, down = box[2] - box[0], box[3] - box[1]
+    narrow = np.log(1 - _WIDE_SHARE) - 3 * np.log(_NARROW) - 1.5 * np.log(2 * np.pi)
+    wide = np.log(_WIDE_SHARE) - 3 * np.log(_WIDE) - 1.5 * np.log(2 * np.pi)
     for b in numba.prange(len(positions)):
         nearest, index = np.empty((height, width), np.float32), np.empty((height, width), np.int32)
         draw_surfels(points, normals, half, rotations[b], positions[b], lens, nearest, index)
         compared = np.zeros((height, width), np.uint8)
-        common = either = count = own = 0
-        energy = missing = 0.0
+        common = either = count = 0
+        left, top, right, bottom = width, height, 0, 0
         for row in range(height):
             for column in range(width):
                 shown = index[row, column] >= 0
                 if known[row, column]:
                     common += shown and mask[row, column]
                     either += shown or mask[row, column]
-                if plain[row, column]:
-                    own += 1
-                    bright = 0.0
-                    for c in range(3):
-                        bright += image[row, column, c] ** 2
-                    energy += bright
-                    if shown:
+                if shown:
+                    left, right = min(left, column), max(right, column + 1)
+                    top, bottom = min(top, row), max(bottom, row + 1)
+                    if usable[row, column]:
                         compared[row, column] = 1
                         count += 1
-                    else:  # a smaller outline must not leave out what fits worst
-                        missing += bright
-        terms[b, 0], terms[b, 1], terms[b, 2] = common / max(either, 1), 1.0, 0.0
-        terms[b, 3] = count / max(own, 1)
-        if count < 12 or energy <= 0:
+        sides = (
+            abs(left - box[0]) / across,
+            abs(right - box[2]) / across,
+            abs(top - box[1]) / down,
+            abs(bottom - box[3]) / down,
+        )
+        misfit = 0.0
+        for side in sides:
+            misfit += min(side / _BOX_STD, _FARTHEST_STD) / 4
+        terms[b, 0], terms[b, 1], terms[b, 2], terms[b, 3] = common / max(either, 1), -_MOST_LOG_ODDS, 0.0, misfit
+        if count < _FEWEST_COMPARED:
             continue
-        fitted = np.empty((height, width))
-        residual = _fit_light(albedo, normals, rotations[b], index, compared, image, fitted)
-        terms[b, 1] = min(np.sqrt((residual + missing) / energy), 1.0)
+        light, fitted, r, total = np.zeros((3, _LIGHTS)), np.zeros((height, width)), rotations[b], 0.0
+        _fit_light(albedo, normals, r, index, compared, image, light)
+        for row in range(height):
+            for column in range(width):
+                if compared[row, column]:
+                    s, error = index[row, column], 0.0
+                    nx = r[0, 0] * normals[s, 0] + r[0, 1] * normals[s, 1] + r[0, 2] * normals[s, 2]
+                    ny = r[1, 0] * normals[s, 0] + r[1, 1] * normals[s, 1] + r[1, 2] * normals[s, 2]
+                    nz = r[2, 0] * normals[s, 0] + r[2, 1] * normals[s, 1] + r[2, 2] * normals[s, 2]
+                    for c in range(3):
+                        value = light[c, 0] + light[c, 1] * nx + light[c, 2] * ny + light[c, 3] * nz
+                        value = max(value * albedo[s, c], 0.0)
+                        fitted[row, column] += value / 3
+                        error += ((np.sqrt(value) - np.sqrt(image[row, column, c])) / level) ** 2
+                    a, b_ = narrow - 0.5 * error / _NARROW**2, wide - 0.5 * error / _WIDE**2
+                    odds = max(a, b_) + np.log(1 + np.exp(-abs(a - b_))) + evidence[row, column]
+                    total += min(max(odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
+        terms[b, 1] = total / (across * down)
         terms[b, 2] = _correlation(fitted, luminance, compared, np.empty((3, height + 1, width + 1)))
 
 
@@ -352,6 +391,9 @@ def _smoothed(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 _MARGIN = 0.4  # of the mask's longest side, on each side
 _MIN_PIXELS = 30  # of a mask in the photograph
+_LOOSE = 0.037  # of a side of the box that a person drew, on each side
+_LEAST_LEVEL = 1e-3
+_BINS, _BRIGHTEST, _BIN_SIGMA, _ANY_COLOUR = 24, 3.0, 0.7, 0.1  # of the histogram of colours around a box
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -362,10 +404,15 @@ class ObjectWindow:
         image: linear radiance.
         luminance: its mean over colours.
         mask: pixels of the object.
+        is_trusted: whether it was given, and not proposed from a box.
         known: pixels at which the mask is known. Pixels that another object may hide, or outside the photograph, are
             not.
         plain: well exposed pixels within the mask, one pixel away from its border.
         signed_distance: to the mask's border, positive inside [px].
+        usable: well exposed pixels that no other object may hide.
+        evidence: -log of the density of a pixel's colour (square root of radiance over `level`) around the box.
+        level: square root of the median luminance.
+        box: where the outline's sides should be: left, top, right, bottom [px].
         intrinsics: intrinsics of the window [px].
         T_camera_world: the inverse of the camera's pose.
         cut: share of the mask's border that lies on the photograph's edge.
@@ -375,9 +422,14 @@ class ObjectWindow:
     image: Float32[np.ndarray, "h w 3"]
     luminance: Float32[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]
+    is_trusted: bool
     known: Bool[np.ndarray, "h w"]
     plain: Bool[np.ndarray, "h w"]
     signed_distance: Float32[np.ndarray, "h w"]
+    usable: Bool[np.ndarray, "h w"]
+    evidence: Float32[np.ndarray, "h w"]
+    level: float
+    box: Float[np.ndarray, "4"]
     intrinsics: Float[np.ndarray, "3 3"]
     T_camera_world: Pose
     cut: float
@@ -424,20 +476,55 @@ def _window(photo: Photograph, name: str, side: int) -> ObjectWindow:
         allowed = f"{_MIN_PIXELS} pixels or more; come closer or take a larger photo"
         raise InvalidInput(f"size of the mask of {name}", f"{int(mask.sum())} pixels", allowed)
     others = np.any([np.zeros_like(mask), *(its for other, its in photo.masks.items() if other != name)], axis=0)
-    frame = _frame(mask, side)
+    drawn = photo.boxes.get(name)
+    corners = mask_box(mask) if drawn is None else np.array(drawn, float)
+    frame = _frame(corners, side)
     own = frame.cut(mask.astype(np.float32)) > 0.5
     hidden = frame.cut((others & ~mask).astype(np.float32)) > 0.5
     beyond = frame.cut(np.zeros(mask.shape, np.float32), 1.0) > 0.5
     exposed = frame.cut(photo.well_exposed.astype(np.float32)) > 0.99
     image = np.ascontiguousarray(frame.cut(photo.image), np.float32)
+    distance, box = signed_distance(own), frame.points(corners.reshape(2, 2)).ravel()
+    level = float(np.sqrt(np.median(image[~beyond].mean(axis=-1)))) + _LEAST_LEVEL
+    evidence = -_log_density(np.sqrt(np.maximum(image, 0)) / level, _outside(own.shape, box) & ~beyond)
+    if drawn is not None:
+        inset = _LOOSE * np.tile(np.ptp(box.reshape(2, 2), axis=0), 2)
+        box = box + inset * (1, 1, -1, -1)
     at_edge = int(mask[[0, -1]].sum() + mask[:, [0, -1]].sum())
     border = int((mask & ~_eroded(mask)).sum())
-    camera, cut = (
-        (frame.intrinsics(photo.intrinsics), photo.T_world_camera.inverse()),
-        at_edge / max(border + at_edge, 1),
+    known = ~(hidden | beyond)
+    return ObjectWindow(
+        image=image,
+        luminance=image.mean(axis=-1),
+        mask=own,
+        known=known,
+        is_trusted=drawn is None,
+        plain=_eroded(own) & exposed,
+        signed_distance=distance,
+        usable=known & exposed,
+        evidence=evidence.astype(np.float32),
+        level=level,
+        box=box,
+        intrinsics=frame.intrinsics(photo.intrinsics),
+        T_camera_world=photo.T_world_camera.inverse(),
+        cut=at_edge / max(border + at_edge, 1),
+        frame=frame,
     )
-    known, plain = ~(hidden | beyond), _eroded(own) & exposed
-    return ObjectWindow(image, image.mean(axis=-1), own, known, plain, signed_distance(own), *camera, cut, frame)
+
+
+def _outside(shape: tuple[int, ...], box: Float[np.ndarray, "4"]) -> Bool[np.ndarray, "h w"]:
+    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return ~((columns > box[0]) & (columns < box[2]) & (rows > box[1]) & (rows < box[3]))
+
+
+def _log_density(colours: Float[np.ndarray, "h w 3"], sample: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Return the log density of each colour among those of a sample: a smoothed histogram and some of every colour."""
+    cells = np.clip(colours / _BRIGHTEST * _BINS, 0, _BINS - 1).astype(int)
+    counts = np.zeros((_BINS,) * 3)
+    np.add.at(counts, tuple(cells[sample].T), 1.0)
+    shares = gaussian_filter(counts, _BIN_SIGMA, mode="nearest") / max(float(sample.sum()), 1.0)
+    shares = (1 - _ANY_COLOUR) * shares + _ANY_COLOUR / _BINS**3
+    return np.log(shares[cells[..., 0], cells[..., 1], cells[..., 2]] * (_BINS / _BRIGHTEST) ** 3)
 
 
 def _eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -445,15 +532,13 @@ def _eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
-def _frame(mask: Bool[np.ndarray, "h w"], side: int) -> WindowFrame:
-    rows, columns = np.nonzero(mask)
-    longest = int(max(np.ptp(rows), np.ptp(columns))) + 1
+def _frame(box: Float[np.ndarray, "4"], side: int) -> WindowFrame:
+    longest = float(np.ptp(box.reshape(2, 2), axis=0).max())
     margin = int(_MARGIN * longest)
-    left, top = int(columns.min()) - margin, int(rows.min()) - margin
-    right, bottom = int(columns.max()) + 1 + margin, int(rows.max()) + 1 + margin
+    (left, top), (right, bottom) = np.floor(box[:2]).astype(int) - margin, np.ceil(box[2:]).astype(int) + margin
     scale = min(1.0, side / longest)
     width, height = max(round((right - left) * scale), 1), max(round((bottom - top) * scale), 1)
-    return WindowFrame(left, top, right, bottom, width, height)
+    return WindowFrame(int(left), int(top), int(right), int(bottom), width, height)
 
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
@@ -519,22 +604,23 @@ class TablePrior:
         return jacobian.T @ jacobian, -jacobian.T @ np.array(residuals)
 
 
-# The loss of an object's pose in photographs: outline, shading and texture.
+# The loss of an object's pose in photographs.
 #
-#     L = (1 - IoU) + w_r * residual + w_c * (1 - correlation) [+ w_p * penalty of the table]
+#     L = [1 - IoU] + w_c (1 - correlation) + w_b misfit - w_g G [+ w_p * penalty of the table]
 #
-# IoU compares the drawn outline with the mask, where that is known (the paper's loss for real photographs).
-# Residual is the relative error sqrt(sum (I - I')^2 / sum I^2) on the mask where I' = albedo * (a + b . n): ambient
-# light and first-order harmonics for each colour and view, by least squares, so that exposure, white balance and
-# the lamp need not be known. Correlation is that of both images after a band pass: it sees labels and edges, and no
-# shading.
+# IoU compares the drawn outline with the mask, where that is known and the mask was given; of kind "iou", as in the
+# paper for real photographs, it is all that counts. G is the sum over drawn pixels of the log odds that the object, not
+# what is around its box, has the colour that is seen (`compare_poses`). Its colours are I' = albedo * (a + b . n):
+# ambient light and first-order harmonics for each colour and view, by robust least squares, so that exposure, white
+# balance and the lamp need not be known. So no mask has to be trusted: the outline ends where the background explains
+# more (as in region-based tracking; Prisacariu and Reid 2012). Correlation is that of both images after a band pass: it
+# sees labels and edges, and no shading. The misfit is that of the outline's sides and the box's.
 
 
 LossKind = Literal["all", "iou"]
 Indices = Int32[np.ndarray, "B h w"]
 Depths = Float32[np.ndarray, "B h w"]
-_RESIDUAL, _CORRELATION, _TABLE = 1.0, 0.5, 1e-3  # weights
-_LEAST_COMPARED = 0.3  # of the mask's plain pixels must be drawn for colours to count
+_EXPLAINED, _CORRELATION, _MISFIT, _TABLE = 0.5, 0.5, 0.1, 1e-3  # weights
 _HALF_SIDE = 0.7  # of a surfel, in spacings
 
 
@@ -544,13 +630,13 @@ class PoseTerms:
 
     Attributes:
         iou: intersection over union of drawn outline and mask.
-        residual: relative error of the colours.
+        explained: mean log odds that pixels show the object, per pixel of the box.
         correlation: correlation of the band-passed images.
         losses: total losses.
     """
 
     iou: Float[np.ndarray, "B"]
-    residual: Float[np.ndarray, "B"]
+    explained: Float[np.ndarray, "B"]
     correlation: Float[np.ndarray, "B"]
     losses: Float[np.ndarray, "B"]
 
@@ -578,14 +664,14 @@ class PoseLoss:
     def terms(self, poses: Pose) -> PoseTerms:
         """Compute the losses of B poses and their parts."""
         found = np.mean([_compare(self.surfels, window, poses) for window in self.windows], axis=0)
-        few = found[:, 3] < _LEAST_COMPARED
-        residual, correlation = np.where(few, 1.0, found[:, 1]), np.where(few, 0.0, found[:, 2])
-        losses = 1 - found[:, 0]
+        iou, explained, correlation, misfit = found.T
+        losses = 1 - iou
         if self.kind == "all":
-            losses = losses + _RESIDUAL * residual + _CORRELATION * (1 - correlation)
+            trusted = np.mean([window.is_trusted for window in self.windows])
+            losses = trusted * losses + _CORRELATION * (1 - correlation) + _MISFIT * misfit - _EXPLAINED * explained
         if self.table is not None:
             losses = losses + _TABLE * self.table.penalties(poses)
-        return PoseTerms(found[:, 0], residual, correlation, losses)
+        return PoseTerms(iou, explained, correlation, losses)
 
 
 def draw(surfels: Surfels, window: ObjectWindow, poses: Pose) -> tuple[Indices, Depths]:
@@ -605,11 +691,11 @@ def lens(intrinsics: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "4"]:
 
 def _compare(surfels: Surfels, window: ObjectWindow, poses: Pose) -> Float[np.ndarray, "B 4"]:
     terms = np.empty((len(poses.position), _TERMS))
-    mask, known, plain = (np.ascontiguousarray(a).view(np.uint8) for a in (window.mask, window.known, window.plain))
+    masks = (np.ascontiguousarray(a).view(np.uint8) for a in (window.mask, window.known, window.usable))
     points, camera = (surfels.points, surfels.normals, surfels.albedo, _half(surfels)), lens(window.intrinsics)
     local, images = rotation_and_position(window.T_camera_world @ poses), (window.image, window.luminance)
     with ONE_AT_A_TIME:
-        compare_poses(*points, *local, camera, *images, mask, known, plain, terms)
+        compare_poses(*points, *local, camera, *images, *masks, window.evidence, window.level, window.box, terms)
     return terms
 
 

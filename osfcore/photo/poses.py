@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial import KDTree
 
 from osfcore.errors import InvalidInput, UnknownName
-from osfcore.estimation.objective import resting_orientations
+from osfcore.estimation.camera_response import srgb_of_linear
+from osfcore.estimation.objective import RestingOrientations, resting_orientations
 from osfcore.estimation.search import CMAES
 from osfcore.fields.kiloosf import KiloOSF
 from osfcore.geometry.poses import (
@@ -24,6 +26,7 @@ from osfcore.geometry.poses import (
     rotate,
     rotation_angle,
 )
+from osfcore.io.image_file import to_uint8
 from osfcore.photo.board import Intrinsics, camera_matrix
 from osfcore.photo.photograph import Photograph
 from osfcore.photo.pose_loss import (
@@ -38,6 +41,7 @@ from osfcore.photo.pose_loss import (
     signed_distance,
     surfels_of,
 )
+from osfcore.photo.segmentation import mask_near
 from osfcore.progress import Progress
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -61,17 +65,17 @@ Losses = Float[np.ndarray, "K"]
 # and a turn about the object's origin. Visibility of surfels is determined at each step and fixed within it.
 
 
-_ITERATIONS = 40
+_ITERATIONS = 20
 _DAMPING = 1e-4
 _MOST_TURN_RAD, _MOST_SHIFT = 0.1, 0.05  # of a step; the shift as a share of the distance
-_LEAST_TURN_RAD, _LEAST_SHIFT = 2e-4, 2e-5
+_LEAST_TURN_RAD, _LEAST_SHIFT = 5e-4, 5e-5
 _COLOUR_WEIGHT = 0.1  # of a surfel's colour: neighbours err together
 _FARTHEST_PX, _OUTLINE_STD_PX = 8.0, 1.0
 _HUBER, _TUKEY = 1.5, 4.0  # deviations at which residuals begin to count less, and nothing
 _LEAST_STD = 0.004  # of colours [radiance]
 _FEWEST = 30  # surfels for colours to count
 _REWEIGHTINGS = 2
-_WORSE = 0.15  # a loss that much above the first: it went astray
+_WORSE = 0.02  # an IoU that much below the first: it went astray
 _BORDER_STD_PX, _BORDER_STD_ON_TABLE_PX = 0.1, 2.0  # of a constant error of the mask's border
 _CORRELATED = 0.03  # share of independent residuals, against which the table's prior counts
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
@@ -93,16 +97,15 @@ def align(loss: PoseLoss, start: Pose) -> tuple[Pose, float]:
     """Refine one pose.
 
     Args:
-        loss: loss whose windows, surfels and table are used. If the result is clearly worse by it than the best pose on
-            the way, that pose is returned.
+        loss: loss whose windows, surfels and table are used. If the outline fits the mask worse in the end, the initial
+            pose is returned.
         start: initial pose, within about a centimetre and ten degrees of the solution.
 
     Returns:
         The pose and its loss.
     """
     prepared = [_prepare(window, loss.surfels, start) for window in loss.windows]
-    first = float(loss(start[None])[0])
-    pose, best, least, value = start, start, first, first
+    pose = start
     for _ in range(_ITERATIONS):
         normal, right = _normal_equations(prepared, loss, pose)
         step = np.linalg.solve(normal + np.diag(_DAMPING * np.diag(normal) + 1e-9), right)
@@ -111,12 +114,11 @@ def align(loss: PoseLoss, start: Pose) -> tuple[Pose, float]:
         shift *= min(1.0, _MOST_SHIFT * depth / max(float(np.linalg.norm(shift)), 1e-12))
         turn *= min(1.0, _MOST_TURN_RAD / max(float(np.linalg.norm(turn)), 1e-12))
         pose = Pose(pose.position + shift, quaternion_multiply(quaternion_exp(turn), pose.quaternion))
-        value = float(loss(pose[None])[0])
-        if value < least:
-            best, least = pose, value
         if np.linalg.norm(shift) < _LEAST_SHIFT * depth and np.linalg.norm(turn) < _LEAST_TURN_RAD:
             break
-    return (pose, value) if value < first + _WORSE else (best, least)
+    terms = loss.terms(Pose.stacked([start, pose]))
+    kept = int(terms.iou[1] > terms.iou[0] - _WORSE)
+    return (pose if kept else start), float(terms.losses[kept])
 
 
 def _prepare(window: ObjectWindow, surfels: Surfels, start: Pose) -> _Prepared:
@@ -230,11 +232,15 @@ def _sample(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return map_coordinates(image, [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], order=1, mode="nearest")
 
 
-# Search for an object's pose: over all rotations from the mask, around a given pose, and by CMA-ES from the best.
+# Search for an object's pose: over all rotations from the box, around a given pose, and by CMA-ES from the best.
 
 
-_CENTRING_ROUNDS = 3
+_CENTRING_ROUNDS = 4
 _MOST_CHANGE = 0.6  # of depth in one round
+_LEAST_SLOPE, _NEAREST_M = 1e-3, 0.05  # of rays toward the table; of what is in front of a camera
+_OUTLINED = 350  # surfels that outline an object well enough
+_SAMPLED, _COARSELY, _REFINED, _ICP_ROUNDS = 400, 3, 120, 10
+_MOST_OFF, _MOTIONS_APART_DEG = 0.035, 14.0
 _PSI = 1.533751168755204288118041413  # the positive root of psi^4 = psi + 4
 _LATERAL_PX, _DEPTH_SHARE, _TURN_RAD = 2.0, 0.03, 0.15  # CMA's first spread
 _GENERATIONS, _POPULATION = 14, 14
@@ -250,8 +256,8 @@ def super_fibonacci(count: int) -> Float[np.ndarray, "count 4"]:
     return np.stack([r * np.sin(alpha), r * np.cos(alpha), big * np.sin(beta), big * np.cos(beta)], axis=1)
 
 
-def poses_from_mask(loss: PoseLoss, quaternions: Float[np.ndarray, "K 4"]) -> Pose:
-    """Find for each rotation the position at which the drawn outline has the centroid and the area of the mask.
+def poses_from_box(loss: PoseLoss, quaternions: Float[np.ndarray, "K 4"]) -> Pose:
+    """Find for each rotation the position at which the object's outline fills its box.
 
     The photograph with the largest mask decides.
 
@@ -259,24 +265,91 @@ def poses_from_mask(loss: PoseLoss, quaternions: Float[np.ndarray, "K 4"]) -> Po
         loss: whose windows and surfels are used.
         quaternions: rotations from the object's frame to the world, unit.
     """
-    window = max(loss.windows, key=lambda w: int(w.mask.sum()))
-    K, centroid, area = window.intrinsics, window.centroid, float(window.mask.sum())
-    ray = np.linalg.solve(K, [*centroid, 1.0])
-    depth = K[0, 0] * loss.surfels.radius / np.sqrt(area / np.pi)
-    local = np.tile(ray * depth, (len(quaternions), 1))
-    camera = window.T_camera_world.inverse()
-    rows, columns = (np.arange(side) + 0.5 for side in window.size)
+    window = _largest(loss)
+    camera, K = window.T_camera_world.inverse(), window.intrinsics
+    low, high = window.box.reshape(2, 2)
+    ray = np.linalg.solve(K, [*(low + high) / 2, 1.0])
+    local = np.tile(ray * K[0, 0] * 2 * loss.surfels.radius / (high - low).max(), (len(quaternions), 1))
     for _ in range(_CENTRING_ROUNDS):
-        index, _ = draw(loss.surfels, window, Pose(camera.apply(local), quaternions))
-        shown = index >= 0
-        per_row, per_column = shown.sum(axis=2), shown.sum(axis=1)
-        found = np.maximum(per_row.sum(axis=1), 1)
-        x, y = per_column @ columns / found, per_row @ rows / found
-        shift = (centroid - np.stack([x, y], axis=1)) / K[[0, 1], [0, 1]] * local[:, 2:]
-        share = np.clip(np.sqrt(found / area), _MOST_CHANGE, 1 / _MOST_CHANGE)
-        shift[found <= 1] = 0
-        local = np.concatenate([local[:, :2] + shift, local[:, 2:]], axis=1) * share[:, None]
+        lower, upper = _sides(loss.surfels, window, Pose(camera.apply(local), quaternions))
+        share = np.exp(np.log(np.maximum(upper - lower, 1e-3) / (high - low)).mean(axis=1))
+        shift = ((low + high) - (lower + upper)) / 2 / K[[0, 1], [0, 1]] * local[:, 2:]
+        local = np.concatenate([local[:, :2] + shift, local[:, 2:]], axis=1)
+        local *= np.clip(share, _MOST_CHANGE, 1 / _MOST_CHANGE)[:, None]
     return Pose(camera.apply(local), quaternions)
+
+
+def poses_on_table(loss: PoseLoss, resting: RestingOrientations) -> Pose:
+    """Find for each resting orientation the place on the table z = 0 at which the outline is centred in its box.
+
+    Args:
+        loss: whose windows and surfels are used; the photograph with the largest mask decides.
+        resting: resting orientations of the object.
+    """
+    window = _largest(loss)
+    camera, heights = window.T_camera_world.inverse(), resting.origin_heights
+    centre = window.box.reshape(2, 2).mean(axis=0)
+    aim = np.tile(centre, (len(heights), 1))
+    for _ in range(_CENTRING_ROUNDS):
+        rays = rotate(camera.quaternion, np.linalg.solve(window.intrinsics, np.c_[aim, np.ones(len(aim))].T).T)
+        reach = (heights - camera.position[2]) / np.minimum(rays[:, 2], -_LEAST_SLOPE)
+        places = camera.position + np.maximum(reach, _NEAREST_M)[:, None] * rays
+        poses = Pose(np.c_[places[:, :2], heights], resting.quaternions)
+        aim = aim + centre - np.mean(_sides(loss.surfels, window, poses), axis=0)
+    return poses
+
+
+def _largest(loss: PoseLoss) -> ObjectWindow:
+    return max(loss.windows, key=lambda window: int(window.mask.sum()))
+
+
+def _sides(surfels: Surfels, window: ObjectWindow, poses: Pose) -> Pair:
+    """Return the least and the greatest coordinates of the outlines of B poses, B x 2 each [px]."""
+    points = surfels.points[:: max(1, len(surfels.points) // _OUTLINED)].astype(np.float64)
+    local = window.T_camera_world @ poses
+    places = np.einsum("bij,sj->bsi", quaternion_to_matrix(local.quaternion), points) + local.position[:, None]
+    pixels = places @ window.intrinsics.T
+    pixels = pixels[..., :2] / np.maximum(pixels[..., 2:], _NEAREST_M)
+    return pixels.min(axis=1), pixels.max(axis=1)
+
+
+def shape_symmetries(surfels: Surfels) -> Pose:
+    """Return rigid motions of an object that change hardly anything but its print, the identity first.
+
+    Of rotations about the centroid from all over SO(3), those that bring surfels nearest to others are refined by ICP.
+    Those at which surfels end within 3.5 % of the radius from others, in the mean, remain, 14 degrees apart.
+
+    Args:
+        surfels: of the object.
+    """
+    points = surfels.points.astype(np.float64)
+    sample = points[:: max(1, len(points) // _SAMPLED)]
+    tree, centre, motions = KDTree(points), points.mean(axis=0), [Pose.identity()]
+    turned = Pose(np.zeros(3), super_fibonacci(_ROTATIONS))
+    moved_ = turned.quaternion, centre - rotate(turned.quaternion, centre)
+    few = sample[::_COARSELY]
+    offs = np.array([tree.query(rotate(q, few) + t)[0].mean() for q, t in zip(*moved_, strict=True)])
+    found: list[tuple[float, Pose]] = []
+    for k in np.argsort(offs)[:_REFINED]:
+        motion = Pose(moved_[1][k], moved_[0][k])
+        for _ in range(_ICP_ROUNDS):
+            motion = _rigid(sample, points[tree.query(motion.apply(sample))[1]])
+        found.append((tree.query(motion.apply(sample))[0].mean() / surfels.radius, motion))
+    for off, motion in sorted(found, key=lambda each: each[0]):
+        apart = rotation_angle(np.stack([m.quaternion for m in motions]), motion.quaternion).min()
+        if off < _MOST_OFF and apart > np.deg2rad(_MOTIONS_APART_DEG):
+            motions.append(motion)
+    return Pose.stacked(motions)
+
+
+def _rigid(points: Float[np.ndarray, "S 3"], targets: Float[np.ndarray, "S 3"]) -> Pose:
+    """Return the rigid motion that brings points nearest to targets in the mean square (Kabsch 1976)."""
+    matrix, middle, goal = np.eye(4), points.mean(axis=0), targets.mean(axis=0)
+    left, _, right = np.linalg.svd((points - middle).T @ (targets - goal))
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    matrix[:3, :3] = (left @ flip @ right).T
+    matrix[:3, 3] = goal - matrix[:3, :3] @ middle
+    return Pose.from_matrix(matrix)
 
 
 def poses_around(pose: Pose, window: ObjectWindow, count: int, rng: np.random.Generator) -> Pose:
@@ -326,7 +399,7 @@ def cma_search(loss: PoseLoss, starts: Pose, spread: float, rng: np.random.Gener
     Returns:
         The best pose of each search and its loss.
     """
-    window = max(loss.windows, key=lambda w: int(w.mask.sum()))
+    window = _largest(loss)
     depths = (window.T_camera_world @ starts).position[:, 2]
     lateral = _LATERAL_PX * depths / window.intrinsics[0, 0]
     turns = [np.full(len(depths), _TURN_RAD)] * 3
@@ -470,11 +543,9 @@ class _FocalSearch:
         return float(focals[k] * (focals[k + 1] / focals[k]) ** np.clip(shift, -0.5, 0.5))
 
     def moved(self, one: PhotoObject, focal: float) -> PhotoObject:
-        """Return an object with its poses for a camera of this focal length, the best first."""
-        loss, sharp = (self._loss(one, focal, side) for side in (_FINE_SIDE, _SHARP_SIDE))
-        poses = Pose.stacked(self._aligned(one, each.pose, focal)[0] for each in (one.best, *one.rivals))
-        best, *rivals = _ranked(poses, _photo_poses(poses, loss, sharp))
-        return replace(one, best=best, rivals=tuple(rivals), doubt=doubt_of(one.name, best, rivals, loss))
+        """Return an object with its poses for a camera of this focal length."""
+        poses = [replace(each, pose=self._aligned(one, each.pose, focal)[0]) for each in (one.best, *one.rivals)]
+        return replace(one, best=poses[0], rivals=tuple(poses[1:]))
 
     def _aligned(self, one: PhotoObject, pose: Pose, focal: float) -> tuple[Pose, float]:
         K = self._photo.intrinsics
@@ -561,7 +632,7 @@ class PhotoPose:
         pose: `T_world_object`.
         loss: loss of `PoseLoss`.
         iou: intersection over union of drawn outline and mask.
-        residual: relative error of the colours.
+        explained: mean log odds that pixels show the object, per pixel of its box.
         correlation: correlation of the band-passed images.
         match: share of the print that is found again, see `print_match`.
     """
@@ -569,9 +640,14 @@ class PhotoPose:
     pose: Pose
     loss: float
     iou: float
-    residual: float
+    explained: float
     correlation: float
     match: float
+
+    @property
+    def score(self) -> float:
+        """The loss, less what is found of the print: poses are ranked by it."""
+        return self.loss - _PRINT * self.match
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -585,6 +661,7 @@ class PhotoObject:
         doubt: why the pose should not be trusted, in one sentence; "" if it can be.
         coarse_s: duration of the search over rotations [s].
         refine_s: duration of the refinement [s].
+        masks: pixels that show it in each photograph, proposals corrected by where it was found; None without any.
     """
 
     name: str
@@ -593,6 +670,7 @@ class PhotoObject:
     doubt: str
     coarse_s: float
     refine_s: float
+    masks: tuple[Bool[np.ndarray, "h w"] | None, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -611,29 +689,35 @@ class PhotoStep:
     table: TableGuess | None = None
     intrinsics: Intrinsics | None = None
 
-    def as_seen(self, photo: Photograph) -> Photograph:
-        """Return the photograph with the focal length that was found, if there is one."""
-        return photo if self.intrinsics is None else replace(photo, intrinsics=self.intrinsics)
+    def as_seen(self, photo: Photograph, number: int = 0) -> Photograph:
+        """Return a photograph with the masks and the focal length that were found.
+
+        Args:
+            photo: as it was given.
+            number: which of the photographs it is.
+        """
+        masks = dict(photo.masks)
+        for found in self.found:
+            mask = found.masks[number] if found.masks else None
+            if found.name in masks and mask is not None:
+                masks[found.name] = mask
+        K = photo.intrinsics if self.intrinsics is None else self.intrinsics
+        return replace(photo, intrinsics=K, masks=masks)
 
 
 # Reasons not to trust a pose in a photograph, one sentence each.
 
 
-LEAST_RATIO = 1.15  # loss of another orientation over that of the best
-_FOUND_PRINT, _MORE_PRINT = 0.6, 0.15  # match of a pose that its print makes sure, and by how much more than others'
+_PRINT = 0.6  # weight of the print that is found again
+LEAST_MARGIN = 0.09  # by which another orientation scores worse
 _LEAST_IOU = 0.85
-_MOST_RESIDUAL = 0.55
+_LEAST_EXPLAINED, _LEAST_MATCH = 0.1, 0.5  # one of them is enough
 _MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
 
 
 def fits_outline(best: PhotoPose) -> bool:
     """Return whether the drawn outline fits the mask."""
     return best.iou >= _LEAST_IOU
-
-
-def has_its_print(best: PhotoPose, others: Sequence[PhotoPose]) -> bool:
-    """Return whether the print of a pose is found again, and that of other orientations clearly less."""
-    return best.match >= max([_FOUND_PRINT, *(other.match + _MORE_PRINT for other in others)])
 
 
 def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: PoseLoss) -> str:
@@ -648,9 +732,9 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
     if not fits_outline(best):
         share = f"they share {100 * best.iou:.0f} %"
         return f"The outline of {name} does not fit its mask ({share}); check the name, the mask and the camera."
-    if best.residual > _MOST_RESIDUAL:
+    if best.explained < _LEAST_EXPLAINED and best.match < _LEAST_MATCH:
         return f"{name} does not look like what the photo shows there; check the name and the mask."
-    if rivals and rivals[0].loss < LEAST_RATIO * best.loss and not has_its_print(best, rivals):
+    if rivals and rivals[0].score < best.score + LEAST_MARGIN:
         return f"{name} looks nearly the same in another orientation; choose between the two pictures."
     if min(window.cut for window in loss.windows) > _MOST_CUT:
         return f"{name} is cut off by the edge of the photo, so that its distance is uncertain."
@@ -669,7 +753,7 @@ def without_others(
     """Return photographs in which an object's mask contains no other object.
 
     The outline of each other object, drawn in its found pose, is added to that object's mask. Pixels of an outline that
-    fits its mask are removed from the mask of the object `name`.
+    fits its mask are removed from the mask of the object `name`, unless that one is nearer.
 
     Args:
         photos: photos with masks.
@@ -677,9 +761,9 @@ def without_others(
         found: all objects.
         surfels: surfels of each object, by name.
     """
-    seen = []
+    seen, own = [], [each.best.pose for each in found if each.name == name]
     for photo in photos:
-        masks = dict(photo.masks)
+        masks, camera = dict(photo.masks), photo.T_world_camera.position
         for other in found:
             if name not in masks or other.name == name or other.name not in masks:
                 continue
@@ -687,30 +771,37 @@ def without_others(
             index, _ = draw(surfels[other.name], window, other.best.pose[None])
             shown = (index[0] >= 0).astype(np.float32)
             drawn = window.frame.placed(shown, masks[name].shape)  # as far as its window reaches
-            if fits_outline(other.best):
+            apart = [float(np.linalg.norm(pose.position - camera)) for pose in (other.best.pose, *own)]
+            if fits_outline(other.best) and apart[0] <= apart[-1]:
                 masks[name] = masks[name] & ~(drawn & masks[other.name])
             masks[other.name] = masks[other.name] | drawn
         seen.append(replace(photo, masks=masks) if name in masks else photo)
     return seen
 
 
-# Poses of known objects in photographs: from masks and fields alone, or from poses that another program gives.
+# Poses of known objects in photographs: from boxes or masks and fields alone, or from poses that another program gives.
 #
-# For each object, candidates are ranked in a small window by outline, shading and texture (`PoseLoss`). Candidates are
-# all rotations at the place of the mask, or poses around a given one. CMA-ES refines the best distinct candidates in
-# the small window and then in a finer one. Gauss-Newton aligns the best of these (`align`). Cameras and masks must be
+# For each object, candidates are ranked in a small window by `PoseLoss`: all rotations in the place of the box; on a
+# known table, all resting orientations there; or poses around a given one. CMA-ES refines the best distinct candidates
+# in the small window. Those that share an outline with the best (`shape_symmetries`) join them in a finer window. For
+# the best of these, the mask is found anew from where the object is drawn, and Gauss-Newton aligns it with that
+# (`align`). What is found of the print decides between the last ones. Objects that most others show not to be where
+# they were found, or that are in doubt, are looked for again, on the table and behind what hides them. Cameras must be
 # given; the light need not be known.
 
 
-_COARSE_SIDE, _FINE_SIDE, _SHARP_SIDE = 44, 130, 240  # of a mask [px]
+_COARSE_SIDE, _FINE_SIDE, _SHARP_SIDE = 44, 130, 240  # of a box [px]
 COARSE_ACROSS, FINE_ACROSS = 36, 110  # surfels along an object's diameter
 _LEAST_SPACING_M = 1.2e-3
 _ROTATIONS = 3000
 _AROUND = 400
-_RANKED, _ALIKE_DEG = 40, 12.0
-_KEPT, _APART_DEG = 8, 15.0
+_RANKED, _ALIKE_DEG = 24, 12.0
+_KEPT, _APART_DEG = 6, 15.0
 _NEAR_DEG = 6.0  # between candidates around a given pose
-_ALIGNED = 4
+_TURNED, _COMPARED = 2, 5  # poses whose shape's symmetries are tried; poses that are refined in the finer window
+_ALIGNED = 3
+_FEWEST_DRAWN = 60  # pixels of an outline from which a mask can be found
+_OFF_TABLE = 0.15  # of loss, by which an object must look better elsewhere than on the table that others stand on
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -739,7 +830,8 @@ class PhotoModels:
     def __init__(self, fields: Mapping[str, KiloOSF]) -> None:
         self._fields = dict(fields)
         self._surfels: dict[tuple[str, int], Surfels] = {}
-        self._priors: dict[str, TablePrior] = {}
+        self._resting: dict[str, RestingOrientations] = {}
+        self._symmetries: dict[str, Pose] = {}
 
     def check(self, name: str) -> None:
         """Check that an object has a field.
@@ -760,12 +852,22 @@ class PhotoModels:
             self._surfels[key] = surfels_of(self._fields[name], max(diameter / across, _LEAST_SPACING_M))
         return self._surfels[key]
 
+    def resting(self, name: str) -> RestingOrientations:
+        """Return the resting orientations of an object."""
+        if name not in self._resting:
+            self.check(name)
+            self._resting[name] = resting_orientations(self._fields[name])
+        return self._resting[name]
+
     def table_prior(self, name: str) -> TablePrior:
         """Return the prior of a table on an object's pose."""
-        if name not in self._priors:
-            self.check(name)
-            self._priors[name] = TablePrior(resting_orientations(self._fields[name]))
-        return self._priors[name]
+        return TablePrior(self.resting(name))
+
+    def symmetries(self, name: str) -> Pose:
+        """Return motions of an object that change hardly anything but its print, see `shape_symmetries`."""
+        if name not in self._symmetries:
+            self._symmetries[name] = shape_symmetries(self.surfels(name, COARSE_ACROSS))
+        return self._symmetries[name]
 
 
 def estimate_photo(
@@ -793,19 +895,16 @@ def estimate_photo(
         models.check(name)
         object_windows(photos, name, _COARSE_SIDE)
     found: list[PhotoObject] = []
+    total = 2 * len(names) + 1
     for number, name in enumerate(names):
-        yield PhotoStep(Progress(number, len(names) + 1, f"Looking for {name}"), tuple(found))
+        yield PhotoStep(Progress(number, total, f"Looking for {name}"), tuple(found))
         found.append(find_object(models, photos, name, rng, config))
-    again = [number for number, one in enumerate(found) if not fits_outline(one.best)] if len(found) > 1 else []
-    total, seen = len(names) + len(again) + 1, {name: photos for name in names}
-    for done, number in enumerate(again, len(names)):
-        yield PhotoStep(Progress(done, total, f"Looking for {names[number]} behind the others"), tuple(found))
-        found[number], seen[names[number]] = _found_behind(models, photos, found, number, rng, config)
     intrinsics = None
     fitting = [one for one in found if fits_outline(one.best)]
     if not (on_table[0] or config.focal_known) and len(fitting) >= _FEWEST_OBJECTS:
-        search, total = _FocalSearch(models, photos[0], fitting, config), total + len(_FOCAL_FACTORS)
-        for done, factor in enumerate(_FOCAL_FACTORS, len(names) + len(again)):
+        seen = PhotoStep(Progress(0, 0, ""), tuple(found)).as_seen(photos[0])
+        search, total = _FocalSearch(models, seen, fitting, config), total + len(_FOCAL_FACTORS)
+        for done, factor in enumerate(_FOCAL_FACTORS, len(names)):
             focal = factor * photos[0].intrinsics[0, 0]
             yield PhotoStep(Progress(done, total, f"Trying a focal length of {focal:.0f} pixels"), tuple(found))
             search.try_out(focal)
@@ -813,85 +912,150 @@ def estimate_photo(
             intrinsics = _with_focal(photos[0].intrinsics, focal)
             found = [search.moved(one, focal) for one in found]
             photos = [replace(photos[0], intrinsics=intrinsics)]
-            seen = {name: [replace(its[0], intrinsics=intrinsics)] for name, its in seen.items()}
-    yield PhotoStep(Progress(total - 1, total, "The table that they lie on"), tuple(found))
-    table = None
+    table, T = None, Pose.identity()
     if not on_table[0]:
         table = table_from_objects([models.table_prior(name) for name in names], [o.best.pose for o in found])
-        if table is not None:
-            for k in table.supported:
-                found[k] = _on_table(models, seen[found[k].name][0], found[k], table, config)
+    if table is not None:
+        T = table.T_world_camera
+        photos, found = [replace(photos[0], T_world_camera=T, on_table=True)], [_moved(one, T) for one in found]
+        config = replace(config, starts={name: T @ pose for name, pose in config.starts.items()})
+    for number, name in enumerate(names):
+        if len(names) > 1 and (table is not None or found[number].doubt):
+            given = tuple(_moved(one, T.inverse()) for one in found)
+            yield PhotoStep(Progress(total - len(names) + number - 1, total, f"Looking again for {name}"), given)
+            found[number] = _found_again(models, photos, found, number, table, rng, config)
+    found = [_moved(one, T.inverse()) for one in found]
     yield PhotoStep(Progress(total, total, "All objects were looked for"), tuple(found), table, intrinsics)
 
 
-def _found_behind(
-    models: PhotoModels, photos: Photos, found: Sequence[PhotoObject], number: int, rng: Rng, config: PhotoConfig
-) -> tuple[PhotoObject, Photos]:
-    """Search an object in masks without the others; return both, or the old ones if it fits no better."""
+def _moved(found: PhotoObject, T: Pose) -> PhotoObject:
+    """Return an object in another world."""
+    best, *rivals = (replace(each, pose=T @ each.pose) for each in (found.best, *found.rivals))
+    return replace(found, best=best, rivals=tuple(rivals))
+
+
+def _found_again(
+    models: PhotoModels,
+    photos: Photos,
+    found: Sequence[PhotoObject],
+    number: int,
+    table: TableGuess | None,
+    rng: Rng,
+    config: PhotoConfig,
+) -> PhotoObject:
+    """Search an object behind the others, on their table; return it as it was if that explains it better.
+
+    An object that stands there without a doubt is no more than aligned with it.
+    """
     before = found[number]
     surfels = {other.name: models.surfels(other.name, FINE_ACROSS) for other in found}
-    without = without_others(photos, before.name, found, surfels)
+    seen = without_others(photos, before.name, found, surfels)
+    tried = Pose.stacked(each.pose for each in (before.best, *before.rivals))
+    is_sure = table is not None and number in table.supported and not before.doubt
     try:
-        now = find_object(models, without, before.name, rng, config)
+        now = find_object(models, seen, before.name, rng, config, tried, is_placed=is_sure)
     except InvalidInput:  # hardly anything is left of its mask
-        return before, photos
-    return (now, without) if now.best.iou > before.best.iou else (before, photos)
+        return before
+    worse = now.best.loss - before.best.loss
+    return now if worse < (0 if table is None else _OFF_TABLE) else before
 
 
-def _on_table(
-    models: PhotoModels, photo: Photograph, found: PhotoObject, table: TableGuess, config: PhotoConfig
+def _ranked(poses: Sequence[PhotoPose], least_deg: float) -> list[int]:
+    """Return the numbers of poses by their scores, without those that are turned like better ones."""
+    scores = np.array([pose.score for pose in poses])
+    return distinct(Pose.stacked(pose.pose for pose in poses), scores, len(poses), least_deg)
+
+
+def find_object(
+    models: PhotoModels,
+    photos: Photos,
+    name: str,
+    rng: Rng,
+    config: PhotoConfig,
+    tried: Pose | None = None,
+    *,
+    is_placed: bool = False,
 ) -> PhotoObject:
-    """Align an object again with a known table. Its pose stays in the camera's frame."""
-    start, surfels = time.perf_counter(), models.surfels(found.name, FINE_ACROSS)
-    seen = object_windows([replace(photo, T_world_camera=table.T_world_camera, on_table=True)], found.name, _SHARP_SIDE)
-    sharp = PoseLoss(seen, surfels, models.table_prior(found.name), config.loss)
-    plain, sharp_plain = (
-        PoseLoss(object_windows([photo], found.name, side), surfels, kind=config.loss)
-        for side in (_FINE_SIDE, _SHARP_SIDE)
+    """Search one object.
+
+    Args:
+        models: models of the objects.
+        photos: photos of one scene, at least one of them with its box or mask.
+        name: name of the object.
+        rng: random generator of the search.
+        config: settings.
+        tried: poses to try besides.
+        is_placed: whether one of these is right to a few degrees, so that nothing else has to be tried.
+    """
+    start, surfels = time.perf_counter(), {a: models.surfels(name, a) for a in (COARSE_ACROSS, FINE_ACROSS)}
+    table = models.table_prior(name) if all(photo.on_table for photo in photos) else None
+    coarse, fine = (
+        PoseLoss(object_windows(photos, name, side), surfels[across], table, config.loss)
+        for side, across in ((_COARSE_SIDE, COARSE_ACROSS), (_FINE_SIDE, FINE_ACROSS))
     )
-    pose = table.T_world_camera.inverse() @ align(sharp, table.T_world_camera @ found.best.pose)[0]
-    best = _photo_poses(pose[None], plain, sharp_plain)[0]
-    doubt = doubt_of(found.name, best, found.rivals, plain)
-    return replace(found, best=best, doubt=doubt, refine_s=found.refine_s + time.perf_counter() - start)
-
-
-def _photo_poses(poses: Pose, loss: PoseLoss, sharp: PoseLoss) -> list[PhotoPose]:
-    """Return poses with the parts of each one's loss, and what is found of their print in sharp windows."""
-    terms = loss.terms(poses)
-    matches = [print_match(sharp, poses[k]) for k in range(len(terms.losses))]
-    parts = zip(terms.losses, terms.iou, terms.residual, terms.correlation, matches, strict=True)
-    return [PhotoPose(poses[k], *(float(v) for v in values)) for k, values in enumerate(parts)]
-
-
-def _ranked(poses: Pose, ready: Sequence[PhotoPose]) -> list[PhotoPose]:
-    """Return the best pose, then its rivals; the one whose print alone is found again comes first."""
-    order = distinct(poses, np.array([pose.loss for pose in ready]), _ALIGNED, _APART_DEG)
-    ranked = [ready[k] for k in order]
-    first = max(ranked, key=lambda pose: pose.match)
-    others = [pose for pose in ranked if pose is not first]
-    return [first, *others] if has_its_print(first, others) else ranked
-
-
-def find_object(models: PhotoModels, photos: Photos, name: str, rng: Rng, config: PhotoConfig) -> PhotoObject:
-    """Search one object in its masks. Arguments are as in `estimate_photo`."""
-    on_table = all(photo.on_table for photo in photos)
-    table = models.table_prior(name) if on_table else None
-    coarse, fine, sharp = (
-        PoseLoss(object_windows(photos, name, side), models.surfels(name, across), table, config.loss)
-        for side, across in ((_COARSE_SIDE, COARSE_ACROSS), (_FINE_SIDE, FINE_ACROSS), (_SHARP_SIDE, FINE_ACROSS))
-    )
-    start = time.perf_counter()
-    given = config.starts.get(name)
-    if given is None:
-        candidates, alike = poses_from_mask(coarse, super_fibonacci(_ROTATIONS)), _ALIKE_DEG
+    middle = start
+    if tried is None or not is_placed:
+        poses = _candidates(models, coarse, name, rng, config, tried)
+        middle = time.perf_counter()
+        poses, losses = cma_search(fine, poses, 0.35, rng)
+        poses = poses[distinct(poses, losses, _ALIGNED, _NEAR_DEG)]
     else:
-        candidates, alike = poses_around(given, coarse.windows[0], _AROUND, rng), _NEAR_DEG
-    ranked = candidates[distinct(candidates, coarse(candidates), _RANKED if given is None else _KEPT, alike)]
+        poses = tried[:_ALIGNED]
+    aligned = [_aligned(photos, fine, poses[k], name) for k in range(len(poses.position))]
+    order = _ranked([pose for pose, _ in aligned], _APART_DEG)
+    best, *rivals = (aligned[k][0] for k in order)
+    best, seen = _aligned(photos, fine, best.pose, name)
+    doubt = doubt_of(name, best, rivals, replace(fine, windows=object_windows(seen, name, _FINE_SIDE)))
+    masks = tuple(photo.masks.get(name) for photo in seen)
+    return PhotoObject(name, best, tuple(rivals), doubt, middle - start, time.perf_counter() - middle, masks)
+
+
+def _candidates(
+    models: PhotoModels, coarse: PoseLoss, name: str, rng: Rng, config: PhotoConfig, tried: Pose | None
+) -> Pose:
+    """Return the poses that are worth a closer look, from a small window."""
+    given = config.starts.get(name)
+    if given is not None:
+        candidates, alike, apart = poses_around(given, coarse.windows[0], _AROUND, rng), _NEAR_DEG, _NEAR_DEG
+        ranked = candidates[distinct(candidates, coarse(candidates), _KEPT, alike)]
+    else:
+        spread = super_fibonacci(_ROTATIONS if coarse.table is None else _ROTATIONS // 3)
+        candidates, apart = poses_from_box(coarse, spread), _APART_DEG
+        if coarse.table is not None:
+            candidates = Pose.joined(candidates, poses_on_table(coarse, models.resting(name)))
+        if tried is not None:
+            candidates = Pose.joined(candidates, tried)
+        ranked = candidates[distinct(candidates, coarse(candidates), _RANKED, _ALIKE_DEG)]
     poses, losses = cma_search(coarse, ranked, 1.0, rng)
-    poses = poses[distinct(poses, losses, _KEPT, _APART_DEG if given is None else _NEAR_DEG)]
-    middle = time.perf_counter()
-    poses, losses = cma_search(fine, poses[:_ALIGNED], 0.35, rng)
-    poses = Pose.stacked(align(sharp, poses[k])[0] for k in distinct(poses, losses, _ALIGNED, _NEAR_DEG))
-    best, *rivals = _ranked(poses, _photo_poses(poses, fine, sharp))
-    doubt = doubt_of(name, best, rivals, fine)
-    return PhotoObject(name, best, tuple(rivals), doubt, middle - start, time.perf_counter() - middle)
+    poses = poses[distinct(poses, losses, _KEPT, apart)]
+    if given is None:
+        symmetries = models.symmetries(name)
+        turned = [poses[k] @ symmetries for k in range(min(_TURNED, len(poses.position)))]
+        poses = Pose.joined(*turned, poses[_TURNED:])
+        fine = PoseLoss(coarse.windows, models.surfels(name, COARSE_ACROSS), coarse.table, coarse.kind)
+        poses = poses[distinct(poses, fine(poses), _COMPARED, _ALIKE_DEG)]
+    return poses
+
+
+def _aligned(photos: Photos, fine: PoseLoss, pose: Pose, name: str) -> tuple[PhotoPose, Photos]:
+    """Align a pose with masks that are found anew where boxes were drawn; return it and the photographs with these."""
+    seen = [_masked(photo, name, fine.surfels, pose) for photo in photos]
+    sharp = replace(fine, windows=object_windows(seen, name, _SHARP_SIDE))
+    pose = align(sharp, pose)[0]
+    terms = replace(fine, windows=object_windows(seen, name, _FINE_SIDE)).terms(pose[None])
+    values = (float(v[0]) for v in (terms.losses, terms.iou, terms.explained, terms.correlation))
+    return PhotoPose(pose, *values, print_match(sharp, pose)), seen
+
+
+def _masked(photo: Photograph, name: str, surfels: Surfels, pose: Pose) -> Photograph:
+    """Return a photograph in which a proposed mask is replaced by one that is found where the object is drawn."""
+    if name not in photo.boxes:
+        return photo
+    window = object_windows([photo], name, _SHARP_SIDE)[0]
+    others = np.any([np.zeros_like(photo.masks[name]), *(m for n, m in photo.masks.items() if n != name)], axis=0)
+    drawn = window.frame.placed((draw(surfels, window, pose[None])[0][0] >= 0).astype(np.float32), others.shape)
+    drawn &= ~(others & ~photo.masks[name])
+    if drawn.sum() < _FEWEST_DRAWN:
+        return photo
+    mask = mask_near(to_uint8(srgb_of_linear(photo.image)), drawn)
+    return photo.with_masks({**{n: m & ~mask for n, m in photo.masks.items()}, name: mask})

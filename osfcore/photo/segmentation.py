@@ -7,12 +7,11 @@ from collections.abc import Mapping
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from osfcore.errors import InvalidInput
-from osfcore.photo.photograph import WindowFrame
+from osfcore.photo.photograph import Box, WindowFrame, mask_box
 
-Box = tuple[float, float, float, float]
 Picture = UInt8[np.ndarray, "h w 3"]
 Labels = UInt8[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
@@ -28,6 +27,7 @@ _FORCED = 0.02  # by which the misfit of what begins from the second must be les
 _CENTRAL = 0.2  # of the sides: clicks within this distance of the middle do not say that something else is in it
 _MOST_MISFIT = 0.3  # above, an outline is doubtful; boxes drawn with usual care have 0.05 to 0.25
 _BEHIND, _FRONT = 0.04, 0.1  # misfit gained without what two outlines share: at most, if it is the other's; at least
+_DRAWN_OFF = 0.07  # of an object's size: how far its drawn outline may be off
 _ITERATIONS = 3
 _OUTLINE_SIGMA = 0.7  # over which the outline is smoothed [px of the reduced picture]
 _WHAT = "box of the object [px]"
@@ -66,17 +66,39 @@ def propose_mask(
     strokes = _checked_stroke(add, shape), _checked_stroke(remove, shape)
     window = _window(box, *shape)
     picture = cv2.bilateralFilter(window.cut(image), -1, _NOISE_LEVELS, _NOISE_RADIUS)
-    corners = np.round(_within(window, np.reshape(box, (2, 2)))).astype(int)
+    corners = np.round(window.points(np.reshape(box, (2, 2)))).astype(int)
     marks = _marks(window, corners, clicks, strokes)
     *free, forced = (_tidied(_cut(picture, start), marks) for start in _starts(marks, corners))
     best = min(free, key=lambda mask: _misfit(mask, corners))
     if _are_central(foreground, box) and _misfit(forced, corners) < _misfit(best, corners) - _FORCED:
         best = forced
-    soft = cv2.GaussianBlur(best.astype(np.float32), (0, 0), _OUTLINE_SIGMA, borderType=cv2.BORDER_REPLICATE)
-    mask = window.placed(soft, shape)
+    mask = window.placed(_smooth(best), shape)
     if not mask.any():
         raise InvalidInput(_WHAT, _corners_text(box), "around something that differs from what surrounds it")
     return mask
+
+
+def mask_near(image: Picture, outline: Mask) -> Mask:
+    """Find the mask of an object from where it is drawn, about right to 7 % of its size: GrabCut near that outline.
+
+    Args:
+        image: encoded RGB, as people see it.
+        outline: pixels at which the object is drawn; returned as it is where nothing is found.
+    """
+    left, top, right, bottom = mask_box(outline)
+    window = _window((left, top, right, bottom), *outline.shape)
+    drawn = (window.cut(outline.astype(np.float32)) > 0.5).astype(np.uint8)
+    reach = max(2, int(_DRAWN_OFF * max(np.ptp(window.points(mask_box(outline).reshape(2, 2)), axis=0))))
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    labels = np.full(drawn.shape, cv2.GC_BGD, np.uint8)
+    labels[cv2.dilate(drawn, around) > 0] = cv2.GC_PR_BGD
+    labels[drawn > 0] = cv2.GC_PR_FGD
+    labels[cv2.erode(drawn, around) > 0] = cv2.GC_FGD
+    found = _tidied(
+        _cut(cv2.bilateralFilter(window.cut(image), -1, _NOISE_LEVELS, _NOISE_RADIUS), labels.copy()), labels
+    )
+    mask = window.placed(_smooth(found), outline.shape)
+    return mask if mask.any() else outline
 
 
 def propose_masks(image: Picture, boxes: Mapping[str, Box], clicks: Mapping[str, Points]) -> dict[str, Mask]:
@@ -119,7 +141,7 @@ def outline_doubt(name: str, box: Box, mask: Mask) -> str:
     inside = _checked_box(box, *mask.shape)
     if _misfit(mask, inside) <= _MOST_MISFIT:
         return ""
-    spans = np.ptp(_extent(mask), axis=0) / np.ptp(np.reshape(inside, (2, 2)), axis=0)
+    spans = np.ptp(mask_box(mask).reshape(2, 2), axis=0) / np.ptp(np.reshape(inside, (2, 2)), axis=0)
     across, down = np.round(100 * spans).astype(int).tolist()
     found = f"The outline of {name} spans {across} % of its box's width and {down} % of its height"
     return f"{found}: draw the box closely around all of the object, or correct the outline."
@@ -134,12 +156,6 @@ def _window(box: Box, height: int, width: int) -> WindowFrame:
     scale = min(1.0, _WORKING_SIDE / max(x1 - x0, y1 - y0))
     size = max(round(scale * (right - left)), 1), max(round(scale * (bottom - top)), 1)
     return WindowFrame(left, top, right, bottom, *size)
-
-
-def _within(window: WindowFrame, points: Points) -> Points:
-    """Map positions into the reduced picture [px]."""
-    per_px = np.array([window.width, window.height]) / (window.right - window.left, window.bottom - window.top)
-    return (points - (window.left, window.top)) * per_px
 
 
 def _checked_box(box: Box, height: int, width: int) -> Box:
@@ -180,9 +196,9 @@ def _marks(window: WindowFrame, corners: np.ndarray, clicks: Pair, strokes: Pair
     marks[y0:y1, x0:x1] = cv2.GC_PR_FGD
     radius = max(round(_CLICK_RADIUS * min(x1 - x0, y1 - y0)), 1)
     on_object = np.zeros_like(marks)
-    for point in _within(window, clicks[0]):
+    for point in window.points(clicks[0]):
         cv2.circle(on_object, np.floor(point).astype(int).tolist(), radius, 1, -1)
-    for point in _within(window, clicks[1]):
+    for point in window.points(clicks[1]):
         cv2.circle(marks, np.floor(point).astype(int).tolist(), radius, cv2.GC_BGD, -1)
     marks[y0:y1, x0:x1][on_object[y0:y1, x0:x1] > 0] = cv2.GC_FGD
     some = 0.3  # of a pixel's area is enough for a stroke that is thin
@@ -212,6 +228,10 @@ def _are_central(clicks: Points, box: Box) -> bool:
     return bool(np.all(np.linalg.norm((clicks - low) / (high - low) - 0.5, axis=1) < _CENTRAL))
 
 
+def _smooth(mask: Mask) -> Float32[np.ndarray, "h w"]:
+    return cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _OUTLINE_SIGMA, borderType=cv2.BORDER_REPLICATE)
+
+
 def _cut(picture: Picture, labels: Labels) -> Mask:
     is_object = labels % 2 == 1  # GC_FGD and GC_PR_FGD are odd
     if is_object.all() or not is_object.any():  # GrabCut needs samples of both
@@ -237,15 +257,9 @@ def _tidied(found: Mask, marks: Labels) -> Mask:
     return kept | holes[1:-1, 1:-1]
 
 
-def _extent(mask: Mask) -> np.ndarray:
-    """Return the top left and the bottom right corner of what a mask holds [px]."""
-    xs, ys = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    return np.array([[xs[0], ys[0]], [xs[-1] + 1, ys[-1] + 1]])
-
-
 def _misfit(mask: Mask, box: np.ndarray | Box) -> float:
     """Return how far a mask's extent is from a box, summed over its four sides, each per side of the box."""
     if not mask.any():
         return np.inf
     corners = np.reshape(box, (2, 2))
-    return float((np.abs(_extent(mask) - corners) / (corners[1] - corners[0])).sum())
+    return float((np.abs(mask_box(mask).reshape(2, 2) - corners) / (corners[1] - corners[0])).sum())

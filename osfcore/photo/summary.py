@@ -25,7 +25,7 @@ from osfcore.photo.camera_files import KnownCamera
 from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, FoundScene
 from osfcore.photo.lamp import LampFit, NearLampFit, photo_lamp, photo_light
 from osfcore.photo.lens import Lens
-from osfcore.photo.photograph import Photograph
+from osfcore.photo.photograph import Box, Photograph, mask_box
 from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, PhotoPose, PhotoStep
 from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, intrinsics_from_focal
 
@@ -140,6 +140,16 @@ class Located:
     def straightened(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
         """Return a mask of the original photo without lens distortion."""
         return self.lens.straightened(mask.astype(np.float32)) > 0.5
+
+    def straight_box(self, box: Box) -> Box:
+        """Return the box around what a box of the original photo holds, without lens distortion."""
+        if not self.lens.bends:
+            return box
+        filled = np.zeros(self.raw.encoded.shape[:2], bool)
+        left, top, right, bottom = np.round(np.maximum(box, 0)).astype(int)
+        filled[top:bottom, left:right] = True
+        x0, y0, x1, y1 = mask_box(self.straightened(filled))
+        return float(x0), float(y0), float(x1), float(y1)
 
 
 def locate(raw: RawPhotograph, focal_px: float | None, board: Board) -> Located:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from app.jobs.job import INPUTS
 from app.jobs.kind import JobKind
@@ -20,7 +21,7 @@ from app.jobs.params import JobParams
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose
 from osfcore.io.files import write_json
-from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, encode
+from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, Vector4, encode
 from osfcore.progress import Progress
 from osfcore.random_streams import Stream, stream_rng
 
@@ -40,12 +41,14 @@ class PhotoInput(Entry):
         T_world_camera: pose over the printed board; None if the photo shows none.
         names: of the objects that are marked in it.
         focal_known: whether its focal length is more than a guess.
+        boxes: drawn around objects whose outlines nobody painted, by name [px].
     """
 
     K: Matrix3
     T_world_camera: Matrix4 | None
     names: list[Text]
     focal_known: bool = True
+    boxes: dict[Text, Vector4] = Field(default_factory=dict)
 
 
 class PhotoParams(JobParams):
@@ -107,7 +110,7 @@ def photo_job(params: PhotoParams, place: JobContext) -> Iterator[Finding]:
     for step in estimate_photo(models, photos, names, rng, config):
         yield Finding(step.progress.done, step.progress.total + 1, step.progress.note, len(step.found))
     assert step is not None
-    photos[0] = step.as_seen(photos[0])
+    photos = [step.as_seen(photo, number) for number, photo in enumerate(photos)]
     yield Finding(step.progress.total, step.progress.total + 1, "The lamp", len(step.found))
     write_json(place.folder / FOUND, encode(summarised(photos, step, models, params.notes, board_of(params.board))))
     for found in step.found:
@@ -126,7 +129,9 @@ def _photograph(folder: Path, number: int, order: PhotoInput) -> Photograph:
 
     T = None if order.T_world_camera is None else Pose.from_matrix(np.array(order.T_world_camera))
     masks = {name: _mask(folder / f"{number}_{name}.png") for name in order.names}
-    return to_photograph(read_photograph(folder / str(number)), np.array(order.K), T, masks)
+    photo = to_photograph(read_photograph(folder / str(number)), np.array(order.K), T, masks)
+    boxes = {name: (left, top, right, bottom) for name, (left, top, right, bottom) in order.boxes.items()}
+    return photo.with_masks(masks, boxes)
 
 
 def _mask(path: Path) -> np.ndarray:

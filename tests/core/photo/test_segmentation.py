@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from osfcore.errors import InvalidInput
-from osfcore.photo.segmentation import outline_doubt, propose_mask, propose_masks
+from osfcore.photo.segmentation import mask_near, outline_doubt, propose_mask, propose_masks
 from tests.support.errors import about
 
 WIDTH, HEIGHT = 200, 160
@@ -65,6 +65,14 @@ def test_an_object_on_a_table_is_found_by_a_mask_that_depends_on_its_input_alone
     assert overlap(found, shape) > 0.9
     cv2.setRNGSeed(other_seed)
     np.testing.assert_array_equal(propose_mask(image, box_around(shape, grown), np.array([centre])), found)
+
+
+@pytest.mark.parametrize("shift_px", [0, 3, -4])
+def test_where_an_object_is_drawn_about_right_its_mask_is_found(shift_px):
+    image, shape, _ = random_scene(3)
+    found = mask_near(image, np.roll(shape, shift_px, axis=1))
+    assert overlap(found, shape) > 0.93
+    assert overlap(np.roll(shape, 8, axis=1), shape) < 0.93
 
 
 def test_a_large_photo_is_no_different():
