@@ -199,8 +199,8 @@ def test_a_page_that_only_watches_moves_its_camera_and_nothing_else(live, browse
         driver.arrive("drives")
         with opened(live, "watches") as page:
             page.send(lift)
-            page.send(msgspec.msgpack.encode(CAMERA | {"position": [2.0, 2.0, 2.0]}))
-            until(lambda: np.allclose(page.camera.position, 2.0))
+            aside = msgspec.msgpack.encode(CAMERA | {"position": [2.0, 2.0, 2.0]})
+            until(lambda: page.send(aside) or np.allclose(page.camera.position, 2.0))  # once the page has been framed
             assert body.position[2] < 0.5
             driver.take("watches")  # which puts back what the former driver held, a moment later
             until(lambda: page.send(lift) or np.isclose(body.position[2], 0.7))
