@@ -691,11 +691,13 @@ def lens(intrinsics: Float[np.ndarray, "3 3"]) -> Float32[np.ndarray, "4"]:
 
 def _compare(surfels: Surfels, window: ObjectWindow, poses: Pose) -> Float[np.ndarray, "B 4"]:
     terms = np.empty((len(poses.position), _TERMS))
-    masks = (np.ascontiguousarray(a).view(np.uint8) for a in (window.mask, window.known, window.usable))
+    mask, known, usable = (np.ascontiguousarray(a).view(np.uint8) for a in (window.mask, window.known, window.usable))
     points, camera = (surfels.points, surfels.normals, surfels.albedo, _half(surfels)), lens(window.intrinsics)
     local, images = rotation_and_position(window.T_camera_world @ poses), (window.image, window.luminance)
     with ONE_AT_A_TIME:
-        compare_poses(*points, *local, camera, *images, *masks, window.evidence, window.level, window.box, terms)
+        compare_poses(
+            *points, *local, camera, *images, mask, known, usable, window.evidence, window.level, window.box, terms
+        )
     return terms
 
 

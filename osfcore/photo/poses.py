@@ -289,7 +289,7 @@ def poses_on_table(loss: PoseLoss, resting: RestingOrientations) -> Pose:
     window = _largest(loss)
     camera, heights = window.T_camera_world.inverse(), resting.origin_heights
     centre = window.box.reshape(2, 2).mean(axis=0)
-    aim = np.tile(centre, (len(heights), 1))
+    aim, poses = np.tile(centre, (len(heights), 1)), Pose(np.zeros((len(heights), 3)), resting.quaternions)
     for _ in range(_CENTRING_ROUNDS):
         rays = rotate(camera.quaternion, np.linalg.solve(window.intrinsics, np.c_[aim, np.ones(len(aim))].T).T)
         reach = (heights - camera.position[2]) / np.minimum(rays[:, 2], -_LEAST_SLOPE)
@@ -1043,8 +1043,10 @@ def _aligned(photos: Photos, fine: PoseLoss, pose: Pose, name: str) -> tuple[Pho
     sharp = replace(fine, windows=object_windows(seen, name, _SHARP_SIDE))
     pose = align(sharp, pose)[0]
     terms = replace(fine, windows=object_windows(seen, name, _FINE_SIDE)).terms(pose[None])
-    values = (float(v[0]) for v in (terms.losses, terms.iou, terms.explained, terms.correlation))
-    return PhotoPose(pose, *values, print_match(sharp, pose)), seen
+    loss, iou, explained, correlation = (
+        float(v[0]) for v in (terms.losses, terms.iou, terms.explained, terms.correlation)
+    )
+    return PhotoPose(pose, loss, iou, explained, correlation, print_match(sharp, pose)), seen
 
 
 def _masked(photo: Photograph, name: str, surfels: Surfels, pose: Pose) -> Photograph:
