@@ -957,7 +957,9 @@ def _found_again(
     except InvalidInput:  # hardly anything is left of its mask
         return before
     worse = now.best.loss - before.best.loss
-    return now if worse < (0 if table is None else _OFF_TABLE) else before
+    taken = now if worse < (0 if table is None else _OFF_TABLE) else before
+    times = {"coarse_s": before.coarse_s + now.coarse_s, "refine_s": before.refine_s + now.refine_s}
+    return replace(taken, **times)
 
 
 def _ranked(poses: Sequence[PhotoPose], least_deg: float) -> list[int]:
@@ -1059,5 +1061,7 @@ def _masked(photo: Photograph, name: str, surfels: Surfels, pose: Pose) -> Photo
     drawn &= ~(others & ~photo.masks[name])
     if drawn.sum() < _FEWEST_DRAWN:
         return photo
-    mask = mask_near(to_uint8(srgb_of_linear(photo.image)), drawn)
+    frame, mask = window.frame, np.zeros_like(drawn)
+    part = np.s_[max(frame.top, 0) : frame.bottom, max(frame.left, 0) : frame.right]  # a photo may be large
+    mask[part] = mask_near(to_uint8(srgb_of_linear(photo.image[part])), drawn[part])
     return photo.with_masks({**{n: m & ~mask for n, m in photo.masks.items()}, name: mask})

@@ -133,7 +133,7 @@ refreshDamaged();
 const showPanel = () => byId("panel").classList.remove("unknown");
 
 /** The panel comes when it is known what belongs there, so that nothing moves under the pointer; or with a first click. */
-const showKnownPanel = () => allAnswered().then(showPanel);
+const showKnownPanel = () => byId("panel").classList.contains("unknown") && allAnswered().then(showPanel);
 document.addEventListener("click", showPanel, { capture: true, once: true });
 
 listen(VISITOR, {
