@@ -1,6 +1,7 @@
 """Sphinx extension: fills the pages `reference/rest-paths` and `rest-models` from the service's OpenAPI schema."""
 
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -84,7 +85,7 @@ def operation(method: str, path: str, told: dict[str, Any]) -> Iterator[str]:
             yield f"Answer {status}: {content(answer['content']) if 'content' in answer else 'nothing'}"
     own = [status for status in told["responses"] if status[0] in "45" and status not in EVERYWHERE]
     if own:
-        yield "Errors: " + " ".join(f"{status}: {told['responses'][status]['description']}" for status in own)
+        yield "\n".join(["Errors:", "", *(f"- {status}: {told['responses'][status]['description']}" for status in own)])
 
 
 def paths(schema: dict[str, Any]) -> Iterator[str]:
@@ -100,9 +101,14 @@ def paths(schema: dict[str, Any]) -> Iterator[str]:
 def models(schema: dict[str, Any]) -> Iterator[str]:
     """Yield the section of each model, sorted by name."""
     for name, told in sorted(schema["components"]["schemas"].items()):
-        yield f"## {name}\n\n{told.get('description', '')}"
+        text, _, attributes = told.get("description", "").partition("\n\nAttributes:\n")
+        yield f"## {name}\n\n{text}"
+        meanings = dict(re.findall(r"^    (\w+): (.+(?:\n     .+)*)", attributes, re.MULTILINE))
         required = told.get("required", ())
-        fields = told.get("properties", {}).items()
+        fields = [
+            (field, {"description": " ".join(meanings.get(field, "").split()), **one})
+            for field, one in told.get("properties", {}).items()
+        ]
         rows = [(field, type_of(one), meaning(one, field in required)) for field, one in fields]
         yield table("field", rows) if rows else type_of(told)
 
