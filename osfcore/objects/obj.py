@@ -6,6 +6,7 @@ of the file.
 
 from __future__ import annotations
 
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise, takewhile
@@ -82,7 +83,7 @@ def read_obj(path: Path, files: NamedFiles, max_faces: int) -> list[Surface]:
 def _statements(data: bytes) -> Iterator[tuple[str, str]]:
     """Yield the first word and the rest of each line, whatever its end, indentation and encoding."""
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("cp1252", errors="replace")
     for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
@@ -157,7 +158,8 @@ def _with_image(material: _Material, rest: str, files: NamedFiles) -> _Material:
         option = words.pop(0)
         count = 1 if option in _WORDS else len(list(takewhile(_is_number, words[: _NUMBERS[option]])))
         options[option], words = words[:count], words[count:]
-    name = rest if files.find(rest) else " ".join(words)
+    plain = " ".join(words)
+    name = next(filter(files.find, (rest, plain, plain.partition(" #")[0])), plain)  # a comment may follow
     try:
         image = files.image(name)
     except FileNotFoundError:

@@ -25,6 +25,7 @@ from tests.core.objects.meshes import (
     msh_bytes,
     obj,
     ply,
+    ply_of_quads,
 )
 from tests.support.errors import about
 
@@ -424,8 +425,12 @@ def put(folder, files):
          "m.mtl": "newmtl b\n", "t.png": encoded(STRIP)},
         {"a.obj": "\ufeff" + obj().replace("\n", "\r").replace(" ", "\t"), "m.mtl": "newmtl a\rmap_Kd t.png\r",
          "t.png": encoded(STRIP)},
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd t.png # of the front\n", "t.png": encoded(STRIP)},
+        {"a.obj": obj().encode("utf-16"), "m.mtl": "newmtl a\nmap_Kd t.png\n".encode("utf-16"),
+         "t.png": encoded(STRIP)},
     ],
-    ids=["plain", "case", "options", "spaces", "windows", "decomposed", "cp1252", "two libraries", "cr"],
+    ids=["plain", "case", "options", "spaces", "windows", "decomposed", "cp1252", "two libraries", "cr", "comment",
+         "utf-16"],
 )  # fmt: skip
 def test_textures_of_obj_are_found_as_programs_name_them(tmp_path, files):
     np.testing.assert_allclose(sides(read_mesh(put(tmp_path, files))), PALETTE, atol=1)
@@ -483,6 +488,35 @@ def test_what_is_missing_beside_a_mesh_is_named(tmp_path, files, missing):
 def test_ply_with_any_line_ends_keeps_its_colours(tmp_path, line_end, is_binary):
     (tmp_path / "a.ply").write_bytes(ply(line_end, is_binary))
     np.testing.assert_allclose(sides(read_mesh(tmp_path / "a.ply")), PALETTE, atol=1)
+
+
+@pytest.mark.parametrize("is_binary", [False, True])
+@pytest.mark.parametrize(
+    ("names", "kind", "most"),
+    [
+        (("red", "green", "blue"), "float", 1),
+        (("red", "green", "blue"), "float", 255),
+        (("red", "green", "blue"), "ushort", 65535),
+        (("diffuse_red", "diffuse_green", "diffuse_blue"), "uchar", 255),
+        (("r", "g", "b"), "int", 255),
+    ],
+)
+def test_colours_of_ply_in_any_unit_and_of_faces_with_four_corners(tmp_path, names, kind, most, is_binary):
+    (tmp_path / "a.ply").write_bytes(ply_of_quads(names, kind, most, is_binary))
+    np.testing.assert_allclose(sides(read_mesh(tmp_path / "a.ply")), PALETTE, atol=1)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "material"),
+    [
+        ({"COLOR_0": np.full((36, 3), np.nan, np.float32)}, None),
+        ({}, {"pbrMetallicRoughness": {"baseColorFactor": [float("inf"), 0, 0, 1]}}),
+        ({"POSITION": np.where(CORNERS > 0, np.inf, CORNERS)}, None),
+    ],
+)
+def test_numbers_that_are_not_finite_are_refused(tmp_path, attributes, material):
+    with pytest.raises(CorruptFile, check=about("finite")):
+        read_glb(tmp_path, attributes, material)
 
 
 @pytest.mark.parametrize("is_magics", [False, True])
