@@ -191,6 +191,7 @@ _MATRIX = ("cameramatrix", "k", "camk", "intrinsicmatrix", "intrinsics", "mtx", 
 _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "d", "dist", "coeffs", "distortion", "d1")
 _MODEL = ("distortionmodel", "distortiontype", "model")
 _WIDTH, _HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
+_SKEW = ("skew", "s")
 _SCALARS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
 _LIKE_COEFFICIENTS = ("distcoef", "distortioncoef", "distortionpar")  # dist_coeff, distortion_coefs and so on
 
@@ -273,8 +274,9 @@ def _matrix(members: Mapping[str, Any]) -> Float[np.ndarray, "3 3"]:
         given = four
     numbers = _array(given, "K")
     if numbers.size == 4:
-        fx, fy, x, y = numbers.ravel()
-        return np.array([[fx, 0, x], [0, fy, y], [0, 0, 1]])
+        fx, fy, x, y = numbers.ravel().tolist()
+        skew = _array([_first(members, _SKEW) or 0.0], "skew")
+        return np.array([[fx, skew.sum(), x], [0, fy, y], [0, 0, 1]])
     if numbers.size != 9:
         raise InvalidInput(f"K of {_OWNER}", shown(numbers.tolist()), "3 x 3 numbers")
     K = numbers.reshape(3, 3)

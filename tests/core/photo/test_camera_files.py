@@ -150,6 +150,8 @@ def test_a_matrix_alone_is_of_the_photo_as_it_was_sent(tmp_path):
         ("a.json", {**REALSENSE, "height": None}, "size of the pictures"),
         ("a.json", {**REALSENSE, "fx": 3.0}, "focal length"),
         ("a.json", {"K": [[600, 2, 320], [0, 600, 240], [0, 0, 1]]}, "skew"),
+        ("a.json", {**REALSENSE, "skew": 1.5}, "skew"),
+        ("a.json", {**REALSENSE, "s": "none"}, "skew"),
         ("a.json", {"intrinsics": {"parameters": 3}}, "RealSense"),
     ],
 )
