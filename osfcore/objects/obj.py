@@ -21,7 +21,8 @@ from osfcore.objects.surface import Surface
 
 GREY = 0.7  # of what has no colour
 _NUMBERS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2, "-bm": 1, "-boost": 1, "-texres": 1}  # at most, behind an option
-_WORDS = ("-blendu", "-blendv", "-cc", "-clamp", "-imfchan", "-type")  # options with one word behind them
+# options with one word behind them
+_WORDS = ("-blendu", "-blendv", "-cc", "-clamp", "-colorspace", "-imfchan", "-type")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,7 +73,8 @@ def read_obj(path: Path, files: NamedFiles, max_faces: int) -> list[Surface]:
             material = rest
         elif key == "mtllib":
             several = rest.split()
-            for name in several if all(files.find(one) for one in several) else [rest]:
+            is_one = files.find(rest) is not None or not any(files.find(one) for one in several)
+            for name in [rest] if is_one else several:
                 materials.update(_materials(name, files))
     points = np.array([row[:3] for row in vertices], float).reshape(-1, 3)
     colours = _vertex_colours(vertices)

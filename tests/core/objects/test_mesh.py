@@ -1,6 +1,7 @@
 import base64
 import json
 import zipfile
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -330,17 +331,15 @@ def test_strips_and_fans_are_triangles(tmp_path, mode, order):
     assert areas.max() < 0.0075
 
 
-@pytest.mark.parametrize("is_embedded", [True, False])
-def test_gltf_with_its_buffer_and_image_outside(tmp_path, is_embedded):
+@pytest.mark.parametrize("name", [None, "textures/my t\u00e4x.png", " my  t.png"])
+def test_gltf_with_its_buffer_and_image_outside(tmp_path, name):
     description, buffer = gltf({"POSITION": CORNERS, "TEXCOORD_0": UV}, IMAGE, encoded(STRIP))
-    uris = {"scene.bin": buffer, "textures/my t\u00e4x.png": encoded(STRIP)}
-    if is_embedded:
-        addresses = [f"data:application/octet-stream;base64,{base64.b64encode(d).decode()}" for d in uris.values()]
+    if name is None:
+        contents = (buffer, encoded(STRIP))
+        addresses = [f"data:application/octet-stream;base64,{base64.b64encode(d).decode()}" for d in contents]
     else:
-        addresses = ["scene.bin", "textures/my%20t%C3%A4x.png"]
-        (tmp_path / "textures").mkdir()
-        for name, data in uris.items():
-            (tmp_path / name).write_bytes(data)
+        addresses = ["scene.bin", quote(name)]
+        put(tmp_path, {"scene.bin": buffer, name: encoded(STRIP)})
     description["buffers"], description["images"] = [{"uri": addresses[0]}], [{"uri": addresses[1]}]
     (tmp_path / "scene.gltf").write_text(json.dumps(description))
     np.testing.assert_allclose(sides(read_mesh(tmp_path / "scene.gltf")), turned(PALETTE), atol=1)
@@ -426,11 +425,12 @@ def put(folder, files):
         {"a.obj": "\ufeff" + obj().replace("\n", "\r").replace(" ", "\t"), "m.mtl": "newmtl a\rmap_Kd t.png\r",
          "t.png": encoded(STRIP)},
         {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd t.png # of the front\n", "t.png": encoded(STRIP)},
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd -colorspace sRGB -s 1 1 1 t.png\n", "t.png": encoded(STRIP)},
         {"a.obj": obj().encode("utf-16"), "m.mtl": "newmtl a\nmap_Kd t.png\n".encode("utf-16"),
          "t.png": encoded(STRIP)},
     ],
     ids=["plain", "case", "options", "spaces", "windows", "decomposed", "cp1252", "two libraries", "cr", "comment",
-         "utf-16"],
+         "colorspace", "utf-16"],
 )  # fmt: skip
 def test_textures_of_obj_are_found_as_programs_name_them(tmp_path, files):
     np.testing.assert_allclose(sides(read_mesh(put(tmp_path, files))), PALETTE, atol=1)
@@ -481,6 +481,13 @@ def test_negative_indices_of_obj_count_back_from_where_they_stand(tmp_path):
 def test_what_is_missing_beside_a_mesh_is_named(tmp_path, files, missing):
     with pytest.raises(CorruptFile, check=about(missing)):
         read_mesh(put(tmp_path, files))
+
+
+def test_of_several_libraries_of_an_obj_the_missing_ones_are_named(tmp_path):
+    files = {"a.obj": obj(head="mtllib here.mtl gone.mtl\n"), "here.mtl": "newmtl a\n"}
+    with pytest.raises(CorruptFile, check=about("gone.mtl")) as caught:
+        read_mesh(put(tmp_path, files))
+    assert "here.mtl" not in str(caught.value)
 
 
 @pytest.mark.parametrize("is_binary", [False, True])
