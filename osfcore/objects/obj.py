@@ -6,6 +6,7 @@ of the file.
 
 from __future__ import annotations
 
+import re
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -72,7 +73,7 @@ def read_obj(path: Path, files: NamedFiles, max_faces: int) -> list[Surface]:
         elif key == "usemtl":
             material = rest
         elif key == "mtllib":
-            several = rest.split()
+            several = [name.replace("\\ ", " ") for name in re.split(r"(?<!\\)\s+", rest)]
             is_one = files.find(rest) is not None or not any(files.find(one) for one in several)
             for name in [rest] if is_one else several:
                 materials.update(_materials(name, files))

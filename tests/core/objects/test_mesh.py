@@ -484,7 +484,7 @@ def test_what_is_missing_beside_a_mesh_is_named(tmp_path, files, missing):
 
 
 def test_of_several_libraries_of_an_obj_the_missing_ones_are_named(tmp_path):
-    files = {"a.obj": obj(head="mtllib here.mtl gone.mtl\n"), "here.mtl": "newmtl a\n"}
+    files = {"a.obj": obj(head="mtllib it\\ is\\ here.mtl gone.mtl\n"), "it is here.mtl": "newmtl a\n"}
     with pytest.raises(CorruptFile, check=about("gone.mtl")) as caught:
         read_mesh(put(tmp_path, files))
     assert "here.mtl" not in str(caught.value)
