@@ -637,16 +637,25 @@ def _extents(image: BopImage, name: str) -> tuple[float, float]:
     return float(np.hypot(np.ptp(rows) + 1, np.ptp(columns) + 1)), float(np.hypot(*np.ptp(pixels, axis=0)))
 
 
-def missing_parts(images: Sequence[BopImage]) -> tuple[str, ...]:
-    """Return sentences about what images of a scene lack, or show several times."""
-    found: dict[str, list[str]] = {}
+def missing_parts(folder: Path, images: Sequence[BopImage]) -> tuple[str, ...]:
+    """Return sentences about what images of a scene lack, or show several times, and about those without a camera."""
+    cameras, annotated = (read_json(folder / name, _image_numbers) for name in (SCENE_CAMERA, SCENE_GT))
+    found = {f"without a camera in {SCENE_CAMERA}": [str(n) for n in sorted(annotated - cameras)]}
     for image in images:
         parts = [] if image.poses or image.twice else ["without annotation of an object"]
         parts += [f"with {name}, whose name nothing says" for name in image.poses if NUMBERED.fullmatch(name)]
         parts += [f"without the file of the mask of {name}" for name in image.unmasked]
         for part in (*parts, *(f"with {name} several times" for name in image.twice)):
             found.setdefault(part, []).append(str(image.number))
-    return tuple(f"Image{'s' * (len(numbers) > 1)} {', '.join(numbers)}: {part}." for part, numbers in found.items())
+    return tuple(
+        f"Image{'s' * (len(numbers) > 1)} {shown(', '.join(numbers), 200)}: {part}."
+        for part, numbers in found.items()
+        if numbers
+    )
+
+
+def _image_numbers(data: object) -> set[int]:
+    return {int(key) for key in data if str(key).isdecimal()} if isinstance(data, dict) else set()
 
 
 # A scene of a BOP data set as an observation over a table, and the annotated poses beside it.
@@ -730,7 +739,7 @@ def read_bop_scene(
     masks = np.stack([[image.masks.get(name, hidden) for name in names] for image in images])
     unmasked = np.array([[name in image.unmasked for name in names] for image in images])
     observation = Observation(placed, pictures, names, masks, None, 0.0, unmasked if unmasked.any() else None)
-    return BopScene(observation, poses, left_out, missing_parts(every))
+    return BopScene(observation, poses, left_out, missing_parts(folder, every))
 
 
 def _in_bop_world(images: Sequence[BopImage]) -> list[Pose]:

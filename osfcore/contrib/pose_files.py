@@ -5,7 +5,7 @@
 | scene_gt.json | annotations of BOP: cam_R_m2c, cam_t_m2c, obj_id by image                   | mm   | bop       |
 | .mat          | results of PoseCNN: rois (column 1 is the class), poses (w, x, y, z, then   | m    | ycb_video |
 |               | the position)                                                               |      |           |
-| .txt          | FoundationPose's ob_in_cam: a 4 x 4 matrix of one object                    | m    | bop       |
+| .txt          | FoundationPose's ob_in_cam: a 4 x 4 or 3 x 4 matrix of one object           | m    | bop       |
 | .json         | DOPE's and NDDS's: objects with class, location, quaternion_xyzw            | cm   | dope      |
 | .json         | happypose's: [{"label", "TWO": [[x, y, z, w], [3]]}]                        | m    | bop       |
 | .json         | {"025_mug": {"position": [3], "quaternion": [w, x, y, z]}}, or that by      | m    | bop       |
@@ -249,7 +249,7 @@ def _of_json(path: Path, choice: PoseChoice) -> dict[str, Pose]:
             return None  # of BOP
         if isinstance(data, list):
             return _of_happypose(decode(list[_HappyposeJson], data, "poses"), choice.names)
-        if isinstance(data, dict) and isinstance(data.get("objects"), list) and "camera_data" in data:
+        if isinstance(data, dict) and isinstance(data.get("objects"), list):
             return _of_dope(decode(list[_DopeJson], data["objects"], "objects"), choice)
         if isinstance(data, dict) and "poses_camera_object" in data:
             by_source = decode(dict[Text, dict[Text, _PoseJson]], data["poses_camera_object"], "poses_camera_object")
@@ -301,11 +301,13 @@ def _of_txt(path: Path, names: tuple[str, ...]) -> dict[str, Pose]:
     """Return the pose of a .txt, of the object that file or folder is named after, or that alone is in the photo."""
     text = content_of(path, shown(path), MAX_BYTES).decode("utf-8", errors="replace")
     try:
-        numbers = np.array(text.replace(",", " ").split(), float)
+        numbers = np.array(re.sub(r"[\[\],;]", " ", text).split(), float)
     except ValueError:
         numbers = np.zeros(0)
+    if numbers.size == 12:
+        numbers = np.append(numbers, (0, 0, 0, 1))
     if numbers.size != 16 or not np.array_equal(numbers[12:], (0, 0, 0, 1)):
-        raise CorruptFile(shown(path), "it is no 4 x 4 matrix with the last row 0 0 0 1, as FoundationPose writes")
+        raise CorruptFile(shown(path), "it is no 4 x 4 matrix with the last row 0 0 0 1, nor its first three rows")
     named = [name for name in (path.stem, *reversed(path.absolute().parent.parts)) if name in names]
     if not named and len(names) != 1:
         allowed = f"the only one with a box or mask, or the name of {path.name} or of a folder above it"

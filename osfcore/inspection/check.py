@@ -134,7 +134,7 @@ def _check_bop(folder: Path) -> Report:
         raise CorruptFile(folder, str(error).rstrip(".")) from None
     names = {name for image in images for name in image.poses}
     facts: dict[str, Any] = {"images": len(images), "objects": len(names)}
-    facts |= {"masks": sum(len(image.masks) for image in images), "notes": missing_parts(images)}
+    facts |= {"masks": sum(len(image.masks) for image in images), "notes": missing_parts(folder, images)}
     facts["cameras in a world"] = sum(image.T_camera_world is not None for image in images)
     world = "cameras in one world" if facts["cameras in a world"] == len(images) else "cameras without a common world"
     summary = f"{facts['images']} images of {facts['objects']} objects, {facts['masks']} masks, {world}"

@@ -10,6 +10,7 @@ import io
 import re
 import shutil
 import tempfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
@@ -327,10 +328,14 @@ def read_mesh(path: Path, scale: float = 1.0, unpacked: Path | None = None) -> T
             return read_mesh(unpack_mesh(path, out, path.name), scale, out)
     files = NamedFiles(path, unpacked)
     try:
-        surfaces = [s for s in _surfaces(path, files) if len(s.faces)]
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused below
+            surfaces = [s for s in _surfaces(path, files) if len(s.faces)]
         files.check()
         if not surfaces:
             raise CorruptFile(files.source, "it holds no triangles")
+        for what, rows in ((name, getattr(s, name)) for s in surfaces for name in ("vertices", "colours")):
+            if not np.all(np.isfinite(rows)):
+                raise CorruptFile(files.source, f"it has {what} that are not finite numbers; export it again")
         _check_count(sum(len(s.faces) for s in surfaces), files.source)  # before they fill a texture
         whole = _whole(surfaces, files.source)
     except OsfError:
@@ -340,7 +345,8 @@ def read_mesh(path: Path, scale: float = 1.0, unpacked: Path | None = None) -> T
         raise CorruptFile(files.source, reason) from error
     except Exception as error:  # readers of six formats raise anything on damaged input
         files.check()
-        raise CorruptFile(files.source, f"it cannot be read as a mesh ({type(error).__name__})") from error
+        reason = "it is damaged, or not as its format wants it; open it in Blender or MeshLab and export it again"
+        raise CorruptFile(files.source, reason) from error
     vertices = whole.vertices * scale
     if suffix in _GLTF_SUFFIXES:
         vertices = vertices @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -375,16 +381,58 @@ def _surfaces(path: Path, files: NamedFiles) -> list[Surface]:
         return read_gltf(path, files)
     if suffix == ".obj":
         return read_obj(path, files, MAX_FACES)
+    if suffix == ".ply":
+        return _read_ply(_with_line_feeds(path.read_bytes()), files)
     import trimesh
 
-    data, image = path.read_bytes(), None
-    options: dict[str, Any] = {}
-    if suffix == ".ply":
-        data = _with_line_feeds(data)
-        image = _ply_image(data, files)
-        options = {"skip_materials": True, "fix_texture": image is not None}
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False, **options)
-    return [_surface(mesh, image, data[:80]) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
+    data = path.read_bytes()
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False)
+    return [_surface(mesh, data[:80]) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
+
+
+# PLY by trimesh, but for colours: it knows them by one name, takes fractions and bytes alone, and mixes up those of
+# polygons with those of their triangles.
+
+_PLY_COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_PLY_CORNERS = ("vertex_indices", "vertex_index")
+
+
+def _read_ply(data: bytes, files: NamedFiles) -> list[Surface]:
+    """Return what a PLY shows: its image, else colours of vertices, else those of faces, else grey."""
+    from trimesh.exchange.ply import load_ply
+    from trimesh.geometry import triangulate_quads
+
+    image = _ply_image(data, files)
+    read: Any = load_ply(io.BytesIO(data), skip_materials=True, fix_texture=image is not None)
+    if read.get("faces") is None:
+        return []
+    vertices, faces = np.asarray(read["vertices"], float), triangulate_quads(read["faces"])
+    uv = getattr(read.get("visual"), "uv", None)
+    if image is not None and uv is not None and len(uv) == len(vertices):
+        return [Surface(vertices, faces, np.ones((len(faces), 3, 3)), np.asarray(uv, float), image)]
+    elements = read["metadata"]["_ply_raw"]
+    by_vertex, by_face = (_ply_colours(elements[name]) for name in ("vertex", "face"))
+    if by_vertex is not None:
+        return [Surface(vertices, faces, by_vertex[faces])]
+    if by_face is None:
+        return [Surface(vertices, faces, np.full((len(faces), 3, 3), GREY))]
+    polygons = elements["face"]["data"]
+    corners = next(polygons[name] for name in _PLY_CORNERS if name in elements["face"]["properties"])
+    counts = [len(row) for row in (corners["f1"] if corners.dtype.names else corners)]
+    numbers = triangulate_quads([[number] * count for number, count in enumerate(counts)])  # of the triangles' polygons
+    return [Surface(vertices, faces, np.repeat(by_face[numbers[:, :1]], 3, axis=1))]
+
+
+def _ply_colours(element: Mapping[str, Any]) -> Float[np.ndarray, "P 3"] | None:
+    """Return the colours of an element of a PLY as fractions; None if it has none."""
+    names = next((names for names in _PLY_COLOURS if set(names) <= element["properties"].keys()), None)
+    if names is None:
+        return None
+    colours = np.column_stack([np.ravel(element["data"][name]) for name in names])
+    most = np.nanmax(colours)
+    if colours.dtype.kind == "f":
+        return colours / (255.0 if most > 1 else 1.0)
+    return colours / (255.0 if most <= 255 else 65535.0)
 
 
 def _with_line_feeds(ply: bytes) -> bytes:
@@ -405,19 +453,15 @@ def _ply_image(ply: bytes, files: NamedFiles) -> UInt8[np.ndarray, "h w 3"] | No
     return files.image(names[0]) if names else None
 
 
-def _surface(mesh: trimesh.Trimesh, image: UInt8[np.ndarray, "h w 3"] | None, head: bytes) -> Surface:
-    """Return what trimesh read, with its image, else with its colours, else grey.
+def _surface(mesh: trimesh.Trimesh, head: bytes) -> Surface:
+    """Return what trimesh read with its colours, else grey.
 
     Args:
         mesh: as trimesh has it.
-        image: of a PLY.
         head: the first 80 bytes of the file, where STL notes how its colours are meant.
     """
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
     visual: Any = mesh.visual  # trimesh's kinds of visuals share no base with these attributes
-    uv = getattr(visual, "uv", None)
-    if image is not None and uv is not None and len(uv) == len(vertices):
-        return Surface(vertices, faces, np.ones((len(faces), 3, 3)), np.asarray(uv, float), image)
     by_vertex = visual.vertex_colors if visual.kind == "vertex" else mesh.vertex_attributes.get("color")
     by_face = visual.face_colors if visual.kind == "face" else mesh.face_attributes.get("color")
     if by_vertex is not None and len(by_vertex) == len(vertices):

@@ -42,7 +42,7 @@ class NamedFiles:
     def find(self, reference: str) -> Path | None:
         """Return where a file lies, or None."""
         plain = reference.strip().strip('"').replace("\\", "/")
-        for path in dict.fromkeys((plain, unquote(plain))):
+        for path in dict.fromkeys((reference, plain, unquote(plain))):  # a name may begin with a space
             direct = self._inside(path)
             if direct is not None:
                 return direct

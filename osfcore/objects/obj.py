@@ -6,6 +6,8 @@ of the file.
 
 from __future__ import annotations
 
+import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise, takewhile
@@ -20,7 +22,8 @@ from osfcore.objects.surface import Surface
 
 GREY = 0.7  # of what has no colour
 _NUMBERS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2, "-bm": 1, "-boost": 1, "-texres": 1}  # at most, behind an option
-_WORDS = ("-blendu", "-blendv", "-cc", "-clamp", "-imfchan", "-type")  # options with one word behind them
+# options with one word behind them
+_WORDS = ("-blendu", "-blendv", "-cc", "-clamp", "-colorspace", "-imfchan", "-type")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -70,8 +73,9 @@ def read_obj(path: Path, files: NamedFiles, max_faces: int) -> list[Surface]:
         elif key == "usemtl":
             material = rest
         elif key == "mtllib":
-            several = rest.split()
-            for name in several if all(files.find(one) for one in several) else [rest]:
+            several = [name.replace("\\ ", " ") for name in re.split(r"(?<!\\)\s+", rest)]
+            is_one = files.find(rest) is not None or not any(files.find(one) for one in several)
+            for name in [rest] if is_one else several:
                 materials.update(_materials(name, files))
     points = np.array([row[:3] for row in vertices], float).reshape(-1, 3)
     colours = _vertex_colours(vertices)
@@ -82,7 +86,7 @@ def read_obj(path: Path, files: NamedFiles, max_faces: int) -> list[Surface]:
 def _statements(data: bytes) -> Iterator[tuple[str, str]]:
     """Yield the first word and the rest of each line, whatever its end, indentation and encoding."""
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("cp1252", errors="replace")
     for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
@@ -157,7 +161,8 @@ def _with_image(material: _Material, rest: str, files: NamedFiles) -> _Material:
         option = words.pop(0)
         count = 1 if option in _WORDS else len(list(takewhile(_is_number, words[: _NUMBERS[option]])))
         options[option], words = words[:count], words[count:]
-    name = rest if files.find(rest) else " ".join(words)
+    plain = " ".join(words)
+    name = next(filter(files.find, (rest, plain, plain.partition(" #")[0])), plain)  # a comment may follow
     try:
         image = files.image(name)
     except FileNotFoundError:

@@ -5,9 +5,10 @@
 | .yaml                   | ROS's camera_info, 1 or 2, as a file or as printed by `ros2 topic echo`                 |
 | .json, .yaml            | what OpenCV's FileStorage writes: camera_matrix, distortion_coefficients                |
 | .yaml                   | Kalibr's camchain of one pinhole camera                                                 |
+| .json                   | NDDS's _camera_settings.json of one viewpoint                                           |
 | .json                   | fx, fy, cx or ppx, cy or ppy and coefficients, as RealSense, Azure Kinect and BOP write |
 | .json                   | K with resolution (height, width), as happypose; intrinsic_matrix by columns, as Open3D |
-| .txt                    | K as 3 x 3 numbers: FoundationPose's cam_K.txt                                          |
+| .txt                    | K as 3 x 3 numbers (FoundationPose's cam_K.txt), or 3 x 4 or 4 x 4, as ScanNet writes   |
 
 Pixel centres are at +0.5 in ours and at whole numbers in all others. Distortion is that of `osfcore.photo.lens`.
 """
@@ -149,6 +150,8 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix_node)
 def _parsed(text: str) -> object:
     """Return what the first document of a YAML text says; OpenCV's header is no YAML, and is left out."""
     body = text.partition("\n")[2] if text.startswith("%YAML") else text
+    if body.startswith("# oST"):
+        raise InvalidInput("format of the camera", "oST", "ROS's .yaml, which cameracalibrator.py writes beside it")
     if body.lstrip().startswith("<"):
         raise InvalidInput("format of the camera", "XML", f"{_KINDS}; OpenCV writes .yaml and .json, too")
     try:
@@ -160,15 +163,22 @@ def _parsed(text: str) -> object:
         raise InvalidInput("format of the camera", f"neither JSON nor YAML{place}", _KINDS) from None
 
 
+_BLANKS = str.maketrans(dict.fromkeys(",;[]()", " "))  # what programs write between numbers and around rows
+
+
 def _numbers(text: str) -> Float[np.ndarray, "N"] | None:
     """Return the numbers of a text of nothing but numbers; None if there is anything else in it."""
     try:
-        return np.array(text.replace(",", " ").split(), float)
+        return np.array(text.translate(_BLANKS).split(), float)
     except ValueError:
         return None
 
 
 def _of_matrix(numbers: Float[np.ndarray, "N"]) -> KnownCamera:
+    if numbers.size in (12, 16):
+        rows = numbers.reshape(-1, 4)
+        if np.array_equal([*rows[:3, 3], *rows[3:].ravel()], (0, 0, 0, 0, 0, 0, 1)[: numbers.size - 9]):
+            numbers = rows[:3, :3].ravel()
     if numbers.size != 9:
         raise InvalidInput("text of the camera", f"{numbers.size} numbers", "the 3 x 3 numbers of K")
     return KnownCamera(None, lens_of(numbers.reshape(3, 3), "", (), _OWNER), None)
@@ -179,9 +189,11 @@ def _of_matrix(numbers: Float[np.ndarray, "N"]) -> KnownCamera:
 
 _MATRIX = ("cameramatrix", "k", "camk", "intrinsicmatrix", "intrinsics", "mtx", "m1")
 _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "d", "dist", "coeffs", "distortion", "d1")
-_MODEL = ("distortionmodel", "model")
+_MODEL = ("distortionmodel", "distortiontype", "model")
 _WIDTH, _HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
+_SKEW = ("skew", "s")
 _SCALARS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
+_LIKE_COEFFICIENTS = ("distcoef", "distortioncoef", "distortionpar")  # dist_coeff, distortion_coefs and so on
 
 
 def _any_camera(data: object) -> KnownCamera:
@@ -201,16 +213,43 @@ def _any_camera(data: object) -> KnownCamera:
     inner = members.get("intrinsics")
     if isinstance(inner, Mapping) and "data" not in inner:  # Azure Kinect
         members |= {"intrinsics": None, **_named(inner.get("parameters", inner))}
-    size = _size(members)
-    K = _matrix(members)
-    if members.get("cameramodel", "pinhole") != "pinhole":
+    members = _of_ndds(members)
+    if str(members.get("cameramodel", "pinhole")).lower() != "pinhole":
         raise InvalidInput("camera_model of the camera", shown(members["cameramodel"]), "pinhole")
+    size = _size(members)
+    K, size = _cropped(_matrix(members), size, members.get("roi"))
     model = "fisheye" if members.get("fisheyemodel") else _first(members, _MODEL)
-    coefficients = _first(members, _COEFFICIENTS)
+    others = tuple(name for name in members if name.startswith(_LIKE_COEFFICIENTS))
+    coefficients = _first(members, (*_COEFFICIENTS, *others))
     if coefficients is None and "k1" in members:
         coefficients = [members.get(name, 0.0) for name in _SCALARS]
     values = () if coefficients is None else _array(coefficients, "distortion").ravel().tolist()
     return _checked(lens_of(K, str(model or ""), values, _OWNER), size)
+
+
+def _of_ndds(members: dict[str, Any]) -> dict[str, Any]:
+    """Return the members of the one viewpoint of NDDS; those that were given of all other files."""
+    views = members.get("camerasettings")
+    if not isinstance(views, list):
+        return members
+    if len(views) != 1:
+        raise InvalidInput("number of cameras in the file", len(views), "1; keep the one that took the photo")
+    view = _named(views[0])
+    return {**_named(view.get("intrinsicsettings")), **_named(view.get("capturedimagesize"))}
+
+
+def _cropped(
+    K: Float[np.ndarray, "3 3"], size: Size | None, roi: object
+) -> tuple[Float[np.ndarray, "3 3"], Size | None]:
+    """Return K and size of the part of a sensor that ROS's region of interest (roi) says; all zeros is the whole."""
+    if not isinstance(roi, Mapping):
+        return K, size
+    members = _named(roi)
+    numbers = _array([members.get(name, 0) for name in ("xoffset", "yoffset", "width", "height")], "roi")
+    if numbers.shape != (4,) or not np.all(numbers[2:]):
+        return K, size
+    left, top, width, height = numbers.tolist()
+    return K - np.array([[0, 0, left], [0, 0, top], [0, 0, 0]]), _size({"width": width, "height": height})
 
 
 def _named(data: object) -> dict[str, Any]:
@@ -235,8 +274,9 @@ def _matrix(members: Mapping[str, Any]) -> Float[np.ndarray, "3 3"]:
         given = four
     numbers = _array(given, "K")
     if numbers.size == 4:
-        fx, fy, x, y = numbers.ravel()
-        return np.array([[fx, 0, x], [0, fy, y], [0, 0, 1]])
+        fx, fy, x, y = numbers.ravel().tolist()
+        skew = _array([_first(members, _SKEW) or 0.0], "skew")
+        return np.array([[fx, skew.sum(), x], [0, fy, y], [0, 0, 1]])
     if numbers.size != 9:
         raise InvalidInput(f"K of {_OWNER}", shown(numbers.tolist()), "3 x 3 numbers")
     K = numbers.reshape(3, 3)

@@ -75,6 +75,7 @@ class Lens:
 _BROWN = ("plumb_bob", "rational_polynomial", "radtan", "brown_conrady", "opencv")
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt4", "opencv_fisheye")
 _COUNTS = (4, 5, 8, 12, 14)  # of coefficients that OpenCV takes
+_MOST_TANGENTIAL = 0.05  # p1 and p2 of real lenses are below 0.01
 _ANOTHER = "plumb_bob, rational_polynomial or equidistant; straighten the pictures first, and leave distortion out then"
 
 
@@ -106,7 +107,11 @@ def lens_of(K: np.ndarray, model: str, coefficients: Sequence[float], owner: str
         return Lens(centred)
     if plain and plain not in _BROWN:
         raise InvalidInput(f"distortion_model of {owner}", shown(model), _ANOTHER)
-    return Lens(centred, _counted(values, _COUNTS, owner))
+    found = _counted(values, _COUNTS, owner)
+    if not plain and len(found) == 4 and max(map(abs, found[2:])) > _MOST_TANGENTIAL:  # k3 and k4 of a fisheye
+        allowed = "with its distortion_model: plumb_bob, or equidistant of a fisheye, of which four numbers do not tell"
+        raise InvalidInput(f"distortion of {owner}", values.tolist(), allowed)
+    return Lens(centred, found)
 
 
 def _counted(values: Float[np.ndarray, "C"], counts: tuple[int, ...], owner: str) -> tuple[float, ...]:

@@ -163,6 +163,8 @@ def test_images_without_annotation_are_left_out_and_missing_masks_told(folder, r
     assert found.observation.unmasked.tolist() == [[False, False], [False, True], [False, False]]
     assert [note for note in found.notes if "Image 9" in note and "annotation" in note]
     assert [note for note in found.notes if "Image 6" in note and NAMES[1] in note]
+    edit(folder / "scene_camera.json", lambda content: content.pop("12"))
+    assert [note for note in read_bop_scene(folder, LINEAR).notes if "Image 12" in note and "camera" in note]
     for mask in (folder / "mask_visib").iterdir():
         mask.unlink()
     refused(InvalidInput, "masks of the objects", read_bop_scene, folder, LINEAR)

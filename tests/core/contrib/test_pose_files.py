@@ -128,6 +128,8 @@ def test_poses_of_dope_are_turned_into_the_frame_of_the_object(tmp_path, label):
     path = write(tmp_path, "000.json", {"camera_data": {}, "objects": [{"class": label, **there}, other]})
     found = read_poses(path)
     assert set(found) == {"003_cracker_box", "Mustard"}
+    bare = write(tmp_path, "001.json", {"objects": [{"class": label, **there}]})
+    assert same(read_poses(bare)["003_cracker_box"], found["003_cracker_box"])
     np.testing.assert_allclose(quaternion_to_matrix(found["003_cracker_box"].quaternion), ours, atol=1e-4)
     np.testing.assert_allclose(found["003_cracker_box"].position, POSE.position, atol=1e-4)
     assert same(read_poses(path, PoseChoice(frame="bop"))["003_cracker_box"], POSE)
@@ -144,6 +146,9 @@ def test_a_matrix_of_foundationpose_is_of_the_object_that_it_is_named_after_or_t
         ((read, found),) = read_poses(folder / "0000.txt", PoseChoice(names=names)).items()
         assert read == name
         assert same(found, POSE)
+    for text in ("\n".join(" ".join(map(str, row)) for row in matrix[:3]), str(matrix.tolist())):
+        (tmp_path / "025_mug.txt").write_text(text)
+        assert same(read_poses(tmp_path / "025_mug.txt", PoseChoice(names=both))["025_mug"], POSE)
     np.savetxt(tmp_path / "0000.txt", matrix)
     refused(InvalidInput, "object of the pose", read_poses, tmp_path / "0000.txt", PoseChoice(names=both))
     shifted = read_poses(tmp_path / "0000.txt", PoseChoice(frame="ycb_video", names=("025_mug",)))

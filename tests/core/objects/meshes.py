@@ -84,6 +84,9 @@ def obj(colours=None, head="mtllib m.mtl\nusemtl a\n", uv=UV) -> str:
     return head + vertices + coordinates + faces
 
 
+_PLY_KINDS = {"uchar": "u1", "ushort": "<u2", "int": "<i4", "float": "<f4"}
+
+
 def ply(line_end="\n", is_binary=False) -> bytes:
     """The box as PLY with a colour and an opacity for each corner."""
     head = f"ply\nformat {'binary_little_endian' if is_binary else 'ascii'} 1.0\nelement vertex 36\n"
@@ -99,6 +102,28 @@ def ply(line_end="\n", is_binary=False) -> bytes:
     head += "".join(f"{x} {y} {z} {r} {g} {b} 9\n" for (x, y, z), (r, g, b) in zip(CORNERS, COLOURS, strict=True))
     head += "".join(f"3 {i} {i + 1} {i + 2}\n" for i in range(0, 36, 3))
     return head.replace("\n", line_end).encode()
+
+
+def ply_of_quads(names, kind, most, is_binary) -> bytes:
+    """The box as PLY of six faces with four corners, with a colour for each.
+
+    Args:
+        names: of the colours.
+        kind: of their numbers, as PLY calls it.
+        most: the number of full brightness.
+        is_binary: whether the numbers are bytes.
+    """
+    head = f"ply\nformat {'binary_little_endian' if is_binary else 'ascii'} 1.0\nelement vertex 8\n"
+    head += "".join(f"property float {k}\n" for k in "xyz") + "element face 6\nproperty list uchar int vertex_indices\n"
+    head += "".join(f"property {kind} {name}\n" for name in names) + "end_header\n"
+    whole = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.03, 0.03) for z in (-0.02, 0.02)], np.float32)
+    corners = [(4, 6, 7, 5), (0, 1, 3, 2), (2, 3, 7, 6), (0, 4, 5, 1), (1, 5, 7, 3), (0, 2, 6, 4)]
+    faces = np.zeros(6, [("n", "u1"), ("i", "<i4", 4), ("c", _PLY_KINDS[kind], 3)])
+    faces["n"], faces["i"], faces["c"] = 4, corners, PALETTE / 255 * most
+    if is_binary:
+        return head.encode() + whole.tobytes() + faces.tobytes()
+    rows = [*whole.tolist(), *([n, *i.tolist(), *c.tolist()] for n, i, c in faces)]
+    return (head + "".join(" ".join(map(str, row)) + "\n" for row in rows)).encode()
 
 
 def msh_bytes(vertices, uv, faces, normals=()) -> bytes:

@@ -1,6 +1,7 @@
 import base64
 import json
 import zipfile
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ from tests.core.objects.meshes import (
     msh_bytes,
     obj,
     ply,
+    ply_of_quads,
 )
 from tests.support.errors import about
 
@@ -329,17 +331,15 @@ def test_strips_and_fans_are_triangles(tmp_path, mode, order):
     assert areas.max() < 0.0075
 
 
-@pytest.mark.parametrize("is_embedded", [True, False])
-def test_gltf_with_its_buffer_and_image_outside(tmp_path, is_embedded):
+@pytest.mark.parametrize("name", [None, "textures/my t\u00e4x.png", " my  t.png"])
+def test_gltf_with_its_buffer_and_image_outside(tmp_path, name):
     description, buffer = gltf({"POSITION": CORNERS, "TEXCOORD_0": UV}, IMAGE, encoded(STRIP))
-    uris = {"scene.bin": buffer, "textures/my t\u00e4x.png": encoded(STRIP)}
-    if is_embedded:
-        addresses = [f"data:application/octet-stream;base64,{base64.b64encode(d).decode()}" for d in uris.values()]
+    if name is None:
+        contents = (buffer, encoded(STRIP))
+        addresses = [f"data:application/octet-stream;base64,{base64.b64encode(d).decode()}" for d in contents]
     else:
-        addresses = ["scene.bin", "textures/my%20t%C3%A4x.png"]
-        (tmp_path / "textures").mkdir()
-        for name, data in uris.items():
-            (tmp_path / name).write_bytes(data)
+        addresses = ["scene.bin", quote(name)]
+        put(tmp_path, {"scene.bin": buffer, name: encoded(STRIP)})
     description["buffers"], description["images"] = [{"uri": addresses[0]}], [{"uri": addresses[1]}]
     (tmp_path / "scene.gltf").write_text(json.dumps(description))
     np.testing.assert_allclose(sides(read_mesh(tmp_path / "scene.gltf")), turned(PALETTE), atol=1)
@@ -424,8 +424,13 @@ def put(folder, files):
          "m.mtl": "newmtl b\n", "t.png": encoded(STRIP)},
         {"a.obj": "\ufeff" + obj().replace("\n", "\r").replace(" ", "\t"), "m.mtl": "newmtl a\rmap_Kd t.png\r",
          "t.png": encoded(STRIP)},
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd t.png # of the front\n", "t.png": encoded(STRIP)},
+        {"a.obj": obj(), "m.mtl": "newmtl a\nmap_Kd -colorspace sRGB -s 1 1 1 t.png\n", "t.png": encoded(STRIP)},
+        {"a.obj": obj().encode("utf-16"), "m.mtl": "newmtl a\nmap_Kd t.png\n".encode("utf-16"),
+         "t.png": encoded(STRIP)},
     ],
-    ids=["plain", "case", "options", "spaces", "windows", "decomposed", "cp1252", "two libraries", "cr"],
+    ids=["plain", "case", "options", "spaces", "windows", "decomposed", "cp1252", "two libraries", "cr", "comment",
+         "colorspace", "utf-16"],
 )  # fmt: skip
 def test_textures_of_obj_are_found_as_programs_name_them(tmp_path, files):
     np.testing.assert_allclose(sides(read_mesh(put(tmp_path, files))), PALETTE, atol=1)
@@ -478,11 +483,47 @@ def test_what_is_missing_beside_a_mesh_is_named(tmp_path, files, missing):
         read_mesh(put(tmp_path, files))
 
 
+def test_of_several_libraries_of_an_obj_the_missing_ones_are_named(tmp_path):
+    files = {"a.obj": obj(head="mtllib it\\ is\\ here.mtl gone.mtl\n"), "it is here.mtl": "newmtl a\n"}
+    with pytest.raises(CorruptFile, check=about("gone.mtl")) as caught:
+        read_mesh(put(tmp_path, files))
+    assert "here.mtl" not in str(caught.value)
+
+
 @pytest.mark.parametrize("is_binary", [False, True])
 @pytest.mark.parametrize("line_end", ["\n", "\r\n", "\r"])
 def test_ply_with_any_line_ends_keeps_its_colours(tmp_path, line_end, is_binary):
     (tmp_path / "a.ply").write_bytes(ply(line_end, is_binary))
     np.testing.assert_allclose(sides(read_mesh(tmp_path / "a.ply")), PALETTE, atol=1)
+
+
+@pytest.mark.parametrize("is_binary", [False, True])
+@pytest.mark.parametrize(
+    ("names", "kind", "most"),
+    [
+        (("red", "green", "blue"), "float", 1),
+        (("red", "green", "blue"), "float", 255),
+        (("red", "green", "blue"), "ushort", 65535),
+        (("diffuse_red", "diffuse_green", "diffuse_blue"), "uchar", 255),
+        (("r", "g", "b"), "int", 255),
+    ],
+)
+def test_colours_of_ply_in_any_unit_and_of_faces_with_four_corners(tmp_path, names, kind, most, is_binary):
+    (tmp_path / "a.ply").write_bytes(ply_of_quads(names, kind, most, is_binary))
+    np.testing.assert_allclose(sides(read_mesh(tmp_path / "a.ply")), PALETTE, atol=1)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "material"),
+    [
+        ({"COLOR_0": np.full((36, 3), np.nan, np.float32)}, None),
+        ({}, {"pbrMetallicRoughness": {"baseColorFactor": [float("inf"), 0, 0, 1]}}),
+        ({"POSITION": np.where(CORNERS > 0, np.inf, CORNERS)}, None),
+    ],
+)
+def test_numbers_that_are_not_finite_are_refused(tmp_path, attributes, material):
+    with pytest.raises(CorruptFile, check=about("finite")):
+        read_glb(tmp_path, attributes, material)
 
 
 @pytest.mark.parametrize("is_magics", [False, True])

@@ -46,6 +46,8 @@ p: [600.0, 0.0, 320.0, 0.0, 0.0, 600.0, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 binning_x: 0
 ---
 """
+PART = ECHO.replace(str(CX), str(CX + 8)).replace(str(CY), str(CY + 6))
+PART = PART.replace("---", "roi: {x_offset: 8, y_offset: 6, width: 600, height: 400, do_rectify: false}")
 KALIBR = f"""cam0:
   cam_overlaps: []
   camera_model: pinhole
@@ -71,6 +73,14 @@ CASES = {
     "bop.json": ({"cx": CX, "cy": CY, "fx": FX, "fy": FY, "height": 480, "width": 640}, (), False, SIZE),
     "happypose.json": ({"K": ROWS, "resolution": [480, 640]}, (), False, SIZE),
     "open3d.json": ({"width": 640, "height": 480, "intrinsic_matrix": K.T.ravel().tolist()}, (), False, SIZE),
+    "ndds.json": ({"camera_settings": [{"intrinsic_settings": {"fx": FX, "fy": FY, "cx": CX, "cy": CY, "s": 0},
+                   "captured_image_size": {"width": 640, "height": 480}}]}, (), False, SIZE),
+    "capitals.yaml": (KALIBR.replace("pinhole", "PINHOLE"), WIDE, True, SIZE),
+    "type.yaml": (KALIBR.replace("distortion_model", "distortion_type"), WIDE, True, SIZE),
+    "tutorial.json": ({"camera_matrix": ROWS, "dist_coeff": [list(D)]}, D, False, None),
+    "printed.txt": (str(ROWS).replace(",", ""), (), False, None),
+    "scannet.txt": ("".join(f"{x} {y} {z} 0\n" for x, y, z in ROWS) + "0 0 0 1\n", (), False, None),
+    "part.yaml": (PART, RATIONAL, False, (600, 400)),
     "lists.json": ({"camera_matrix": ROWS, "distCoeffs": [list(D)], "imageSize": [640, 480]}, D, False, SIZE),
 }  # fmt: skip
 
@@ -124,6 +134,12 @@ def test_a_matrix_alone_is_of_the_photo_as_it_was_sent(tmp_path):
         ("a.yaml", "&a {cam0: *a}", "camera_matrix, K"),
         ("a.yaml", "&a {k: *a}", "K of the camera"),
         ("a.yaml", "!!python/object/apply:os.getcwd []", "neither JSON nor YAML"),
+        ("a.yaml", KALIBR.replace("pinhole", "ds").replace("[", "[-0.2, 0.5, "), "ds"),
+        ("a.yaml", ROS.replace("distortion_model: MODEL", "").replace("DATA", "[-.1, .2, .1, -.3]"), "equidistant"),
+        ("a.yaml", ECHO.replace("---", "roi: {width: [1, 2], height: 3}"), "roi"),
+        ("ost.txt", "# oST version 5.0 parameters\n\n\n[image]\n\nwidth\n640\n", "cameracalibrator.py"),
+        ("a.json", {"camera_settings": [{}, {}]}, "number of cameras"),
+        ("a.txt", "600 0 320 1 0 600 240 0 0 0 1 0", "12 numbers"),
         ("a.xml", "<?xml version='1.0'?><opencv_storage/>", "XML"),
         ("a.txt", "1 0 0 0 1 0", "6 numbers"),
         ("a.txt", "", "ROS's camera_info"),
@@ -134,6 +150,8 @@ def test_a_matrix_alone_is_of_the_photo_as_it_was_sent(tmp_path):
         ("a.json", {**REALSENSE, "height": None}, "size of the pictures"),
         ("a.json", {**REALSENSE, "fx": 3.0}, "focal length"),
         ("a.json", {"K": [[600, 2, 320], [0, 600, 240], [0, 0, 1]]}, "skew"),
+        ("a.json", {**REALSENSE, "skew": 1.5}, "skew"),
+        ("a.json", {**REALSENSE, "s": "none"}, "skew"),
         ("a.json", {"intrinsics": {"parameters": 3}}, "RealSense"),
     ],
 )
