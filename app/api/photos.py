@@ -131,7 +131,9 @@ class FindIn(Input):
     """How to look for what is marked."""
 
     together: list[str] = Field(
-        default=[], max_length=8, description="Further photos of the same table; the board must be in view of all."
+        default=[],
+        max_length=8,
+        description="Further photos of the same table, each with the board or with objects that another shows as well.",
     )
     seed: Seed = 0
 
@@ -199,6 +201,7 @@ class PhotoFacts(BaseModel):
     focal_source: CameraSource = Field(description="The board, the user, the file, how objects stand, or nothing.")
     on_board: bool = Field(description="Whether the board is in view.")
     board: str = Field(description="That was looked for, in words; empty for the one to print.")
+    marked: list[str] = Field(description="Names of the objects that are marked in it.")
 
 
 class TablePhotoOut(PhotoFacts):
@@ -251,6 +254,7 @@ def _facts(photo: TablePhoto) -> PhotoFacts:
         focal_source=photo.source,
         on_board=photo.T_world_camera is not None,
         board=photo.board,
+        marked=[entry.name for entry in photo.objects],
     )
 
 

@@ -406,11 +406,11 @@ class EvaluatePhotosCommand(DataCommand):
     tasks: int = 20
     """Simulated scenes with a near lamp; a fourth as many have a distant one."""
     views: int = 1
-    """Photographs of each simulated scene, 1 to 4."""
+    """Photographs of each drawn table, 1 to 8, which are looked at together; of each simulated scene, 1 to 4."""
     start: str = "none"
     """none; perturbed (3 cm and 20 deg off the truth); or a source of poses in photo.json, such as posecnn_raw."""
     plane: Literal["known", "free"] = "free"
-    """Whether the table's plane is known, from the measured depth."""
+    """Whether the table's plane is known, as it was drawn or from the measured depth."""
     masks: Literal["given", "boxes"] = "given"
     """The folder's, or what a box around each of them and one click give, as a user has it."""
     mask_error: int = 0
@@ -438,7 +438,7 @@ class EvaluatePhotosCommand(DataCommand):
         folder, data = self.out or self.data_dir / "photos", self.data
         if self.drawn:
             data = folder / "drawn"
-            write_drawn_photos(self.assets, data, self.seed, self.drawn)
+            write_drawn_photos(self.assets, data, self.seed, self.drawn, self.views)
         if data is None:
             allowed = "a folder of photographs, or --drawn or --lamps simulated, which need none"
             raise InvalidInput("data", "missing", allowed)

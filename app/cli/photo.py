@@ -95,7 +95,7 @@ class PhotoEstimate(DataCommand):
     """Find known objects and the lamp in photographs; a box around each object, or a mask, says what to look for."""
 
     photo: tuple[Path, ...]
-    """JPEG, PNG or HEIC; several of one table must all show the board."""
+    """JPEG, PNG or HEIC; several of one table show the board, or the same objects."""
     out: Path
     """JSON to write."""
     boxes: tuple[str, ...] = ()
@@ -134,11 +134,10 @@ class PhotoEstimate(DataCommand):
         rng = stream_rng(self.seed, Stream.PHOTO_SEARCH)
         config = PhotoConfig(starts, focal_known=focal_known)
         last = last_of(estimate_photo(models, photos, names, rng, config))
-        photos = tuple(last.as_seen(photo, number) for number, photo in enumerate(photos))
-        result = encode(summarised(photos, last, models, notes, board_of(self.board)))
+        result = encode(summarised(last, models, notes, board_of(self.board)))
         write_json(self.out, result)
         if self.images is not None:
-            _write_sheets(self.images, models, photos, last)
+            _write_sheets(self.images, models, last)
         self.say(*_summary(result), f"Wrote {self.out}.")
         return result
 
@@ -179,9 +178,6 @@ class PhotoEstimate(DataCommand):
             self.say(*notes)
         for path, raw, its, marked in zip(self.photo, raws, masks, boxes, strict=True):
             found = locate(raw, self.focal, board) if camera is None else locate_calibrated(raw, camera, board)
-            if found.T_world_camera is None and len(raws) > 1:
-                allowed = f"to be seen, since there are several photos ({found.missing.rstrip('.')})"
-                raise InvalidInput(f"board in {shown(path.name)}", "missing", allowed)
             straight = {name: found.straightened(mask) for name, mask in its.items()}
             photo = to_photograph(found.raw, found.intrinsics, found.T_world_camera, straight)
             photos.append(photo.with_masks(straight, {name: found.straight_box(box) for name, box in marked.items()}))
@@ -243,14 +239,14 @@ def _box(text: str, paths: Sequence[Path], raws: Sequence[RawPhotograph]) -> tup
     return fitting[0], name, (scale * left, scale * top, scale * right, scale * bottom)
 
 
-def _write_sheets(folder: Path, models: PhotoModels, photos: Sequence[Photograph], step: PhotoStep) -> None:
+def _write_sheets(folder: Path, models: PhotoModels, step: PhotoStep) -> None:
     """NAME.png, or NAME-1.png and so on for each photo with a mask of it."""
     from osfcore.inspection.contact_sheet import write_sheet
 
     for found in step.found:
-        for number, photo in enumerate(photos, 1):
+        for number, photo in enumerate(step.photos, 1):
             if found.name in photo.masks:
-                name = found.name if len(photos) == 1 else f"{found.name}-{number}"
+                name = found.name if len(step.photos) == 1 else f"{found.name}-{number}"
                 write_sheet(folder / f"{name}.png", models, photo, found)
 
 

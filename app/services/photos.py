@@ -56,6 +56,7 @@ from osfcore.photo.board import Board, board_of
 from osfcore.photo.calibration import Calibration, Sighting
 from osfcore.photo.camera_files import KnownCamera
 from osfcore.photo.found_scene import FoundScene
+from osfcore.photo.photograph import check_shared
 from osfcore.photo.table_layout import TableLayout, layout_of
 
 # Photographs of tables: taken in, marked by a person, and looked at by a job (`app.jobs.kinds.photos`)
@@ -205,14 +206,14 @@ class TablePhotos(TablePhotoStore):
 
         Args:
             photo: identifier.
-            together: further photographs of the same table; all show the board then.
+            together: further photographs of the same table.
             seed: of the searches.
 
         Raises:
             UnknownName: if there is no such photo.
             NothingMarked: if no object is marked.
             MissingFields: if an object can no longer be recognised.
-            InvalidInput: if several photographs do not all show the board.
+            InvalidInput: if one of several shows neither the board nor an object that another shows.
             QueueFull, StorageFull: if too many jobs wait, or nothing more may be written.
         """
         check_seed(seed)
@@ -220,9 +221,8 @@ class TablePhotos(TablePhotoStore):
         first = photos[0]
         if not first.objects:
             raise NothingMarked
-        boards = sum(each.T_world_camera is not None for each in photos)
-        if len(photos) > 1 and boards < len(photos):
-            raise InvalidInput("photos with the board in view", f"{boards} of {len(photos)}", "all of them")
+        marked = [{entry.name for entry in each.objects} for each in photos]
+        check_shared(marked, [each.T_world_camera is not None for each in photos])
         names = tuple(dict.fromkeys(entry.name for each in photos for entry in each.objects))
         self._fields.require(names, "ours")
         self._end_search(first)

@@ -5,6 +5,8 @@ A photographed scene is a folder with photo.json:
     {"image": file, "encoding": "sRGB" or "linear", "K": 3 x 3 [px], pixel centres at +0.5,
      "masks": {object: file}, in which more than 127 is the object,
      "depth": file, 16 bit, and "depth_unit_m"; may be missing,
+     "T_table_camera": 4 x 4, pose over the table's plane z = 0; may be missing,
+     "table": text; photographs with the same one show one table, and are looked at together; may be missing,
      "poses_camera_object": {source: {object: {"position": [3], "quaternion": [w, x, y, z]}}}}
 
 The source "ground_truth" is the truth; without one, "posecnn_refined_with_depth" stands for it. A folder of lamps
@@ -33,7 +35,7 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose, quaternion_exp, quaternion_multiply, unit_quaternion
 from osfcore.inspection.contact_sheet import write_sheet
 from osfcore.io.files import read_json, write_json
-from osfcore.io.json_codec import Entry, Matrix3, Text, Vector3, Vector4, decode
+from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, Vector3, Vector4, decode
 from osfcore.metrics.pose_errors import pose_error
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.photo.lamp import ShadedPixels, fit_lamp
@@ -64,6 +66,8 @@ class _PhotoJson(Entry):
     masks: dict[Text, Text]
     depth: Text | None = None
     depth_unit_m: FiniteFloat = Field(1e-3, gt=0)
+    T_table_camera: Matrix4 | None = None
+    table: Text | None = None
     poses_camera_object: dict[Text, dict[Text, _PoseJson]] = Field(default_factory=dict)
 
 
@@ -77,6 +81,8 @@ class PhotoFolder:
         photo: linear; the world is the camera's frame.
         depth: measured, along the camera's z axis [m]; 0 where nothing was measured. None without one.
         poses: `T_camera_object` by source and object.
+        T_table_camera: pose over the table; None if it is not written.
+        table: what photographs of one table share; the folder's name if nothing is written.
     """
 
     name: str
@@ -84,6 +90,8 @@ class PhotoFolder:
     photo: Photograph
     depth: Float[np.ndarray, "h w"] | None
     poses: Mapping[str, Mapping[str, Pose]]
+    T_table_camera: Pose | None
+    table: str
 
     @property
     def reference(self) -> Mapping[str, Pose]:
@@ -135,7 +143,8 @@ def read_scene(folder: Path) -> PhotoFolder:
         source: {name: Pose(np.array(p.position), unit_quaternion(np.array(p.quaternion))) for name, p in its.items()}
         for source, its in known.poses_camera_object.items()
     }
-    return PhotoFolder(folder.name, image, photo, depth, poses)
+    over = None if known.T_table_camera is None else Pose.from_matrix(np.array(known.T_table_camera))
+    return PhotoFolder(folder.name, image, photo, depth, poses, over, known.table or folder.name)
 
 
 def read_lamps(folder: Path) -> tuple[LampSubject, ...]:
@@ -369,7 +378,7 @@ class EvaluatePhotos:
         data: folder of folders of photographs, see `folders`.
         start: "none"; "perturbed": 3 cm and 20 deg off the ground truth, in random directions; or the name of a source
             of poses. Scenes that lack it are left out.
-        plane: "known": fitted to the measured depth around the objects; "free".
+        plane: "known": the one that is written, or fitted to the measured depth around the objects; "free".
         masks: "given"; "boxes": proposed from the given mask's bounding box, a little looser, and a click at the point
             farthest from its border, as a person would mark the object.
         mask_error_px: masks are grown and shrunk by that much in turn.
@@ -408,8 +417,13 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ev
     scenes = [read_scene(path.parent) for path in described(config.data)]
     lamps = sorted(path.parents[1] for path in config.data.glob(f"**/{_MIRROR}/{_MIRROR}.mask.png"))
     known = set(fields.names())
-    asked = [(scene, _names(config, scene, known)) for scene in scenes]
-    cases = [(scene, names, number) for scene, names in asked if names for number in range(config.repeats)]
+    tables: dict[str, list[PhotoFolder]] = {}
+    for scene in scenes:  # poses to begin with belong to one photograph
+        tables.setdefault(scene.table if config.start == NONE else scene.name, []).append(scene)
+    asked = [
+        (its, list(dict.fromkeys(n for each in its for n in _names(config, each, known)))) for its in tables.values()
+    ]
+    cases = [(its, names, number) for its, names in asked if names for number in range(config.repeats)]
     without = sum(name not in known for scene in scenes for name in scene.photo.masks)
     if not cases and not lamps:
         allowed = f"a folder of photographs with photo.json that have poses named {config.start!r}"
@@ -417,20 +431,23 @@ def evaluate_photos(config: EvaluatePhotos, fields: FieldLibrary) -> Iterator[Ev
     loaded = {name: fields.load(name) for name in sorted({name for _, names in asked for name in names})}
     models, renderer = PhotoModels(loaded), SceneRenderer(loaded, None)
     scores: list[PhotoScore] = []
-    for done, (scene, names, number) in enumerate(cases):
-        yield EvaluationStep(done, len(cases), f"{len(names)} objects in {scene.name}")
-        rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, zlib.crc32(scene.name.encode()), number)
-        photo = _photo(config, scene)
-        starts = {name: _start(config, scene, name, rng) for name in names}
-        placed = {name: photo.T_world_camera @ start for name, start in starts.items() if start is not None}
-        *_, last = estimate_photo(models, [photo], names, rng, PhotoConfig(placed, config.loss))
+    for done, (its, names, number) in enumerate(cases):
+        yield EvaluationStep(done, len(cases), f"{len(names)} objects in {its[0].name}")
+        rng = stream_rng(config.seed, Stream.PHOTO_SEARCH, zlib.crc32(its[0].name.encode()), number)
+        photos = [_photo(config, scene) for scene in its]
+        starts = {name: _start(config, its[0], name, rng) for name in names}
+        placed = {name: photos[0].T_world_camera @ start for name, start in starts.items() if start is not None}
+        *_, last = estimate_photo(models, photos, names, rng, PhotoConfig(placed, config.loss))
+        seen = {name: [k for k, photo in enumerate(last.photos) if name in photo.masks] for name in names}
         for found in last.found:
+            scene, photo = its[seen[found.name][0]], last.photos[seen[found.name][0]]
             moved = replace(found, best=replace(found.best, pose=photo.T_world_camera.inverse() @ found.best.pose))
             write_sheet(config.folder / f"{scene.name}-{found.name}-{number}.png", models, scene.photo, moved)
-            used, given = last.as_seen(photo).masks[found.name], scene.photo.masks[found.name]
+            used, given = photo.masks[found.name], scene.photo.masks[found.name]
             mask_iou = float((used & given).sum() / (used | given).sum())
             fills_box = not outline_doubt(found.name, box_and_click(given)[0], used)
             scores.append(replace(_score(renderer, scene, moved), mask_iou=mask_iou, fills_box=fills_box))
+        scores += [_not_found(its, name) for name in names if not seen[name]]
     lamp_errors = {subject.name: lamp_errors_deg(subject) for path in lamps for subject in read_lamps(path)}
     report = photo_report(scores, lamp_errors, without)
     write_json(config.folder / "report.json", report)
@@ -483,6 +500,15 @@ def _score(renderer: SceneRenderer, scene: PhotoFolder, found: PhotoObject) -> P
     )
 
 
+def _not_found(scenes: Sequence[PhotoFolder], name: str) -> PhotoScore:
+    """Return the score of an object that is in no photograph that could be used."""
+    scene = next(each for each in scenes if name in each.photo.masks)
+    is_true, turn_deg = GROUND_TRUTH in scene.poses, 180.0 if name in scene.reference else None
+    return PhotoScore(
+        scene.name, name, is_true, 0.0, None, None, turn_deg, f"{name} was not found.", None, 0.0, 0.0, 0.0, 0.0
+    )
+
+
 def _photo(config: EvaluatePhotos, scene: PhotoFolder) -> Photograph:
     photo = scene.photo
     if config.masks == "boxes":
@@ -496,7 +522,9 @@ def _photo(config: EvaluatePhotos, scene: PhotoFolder) -> Photograph:
         change = (cv2.dilate, cv2.erode)
         masks = {name: change[k % 2](m.astype(np.uint8), kernel) > 0 for k, (name, m) in enumerate(photo.masks.items())}
         photo = replace(photo, masks=masks)
-    if config.plane == "known" and scene.depth is not None:
+    if config.plane == "known" and scene.T_table_camera is not None:
+        photo = replace(photo, T_world_camera=scene.T_table_camera, on_table=True)
+    elif config.plane == "known" and scene.depth is not None:
         T_world_camera = table_from_points(scene.table_points(), stream_rng(config.seed, Stream.PHOTO_PLANE))
         photo = replace(photo, T_world_camera=T_world_camera, on_table=True)
     return photo

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -72,7 +72,7 @@ class Photograph:
         well_exposed: pixels whose radiance was measured: no channel is saturated, and not all are black.
         intrinsics: K, focal lengths and principal point [px], pixel centres at +0.5.
         T_world_camera: pose of the camera in the world, OpenCV axes.
-        on_table: whether the world's z = 0 is the table's plane; if not, the world is the camera's own frame.
+        on_table: whether the world's z = 0 is the table's plane; if not, the world is the frame of the first camera.
         masks: pixels that show an object, by its name.
         boxes: drawn around objects whose masks are no more than proposals, by name; masks of others are trusted.
     """
@@ -101,8 +101,6 @@ class Photograph:
         pose = self.T_world_camera
         if pose.position.shape != (3,) or not np.all(np.isfinite(pose.matrix())):
             raise InvalidInput("pose of the photo's camera", pose.position.tolist(), "one pose of finite numbers")
-        if not self.on_table and not np.allclose(pose.matrix(), np.eye(4)):
-            raise InvalidInput("pose of the photo's camera", "another", "the identity where no table is known")
         for name, mask in self.masks.items():
             _check_mask(name, mask, self.image.shape[:2])
 
@@ -157,6 +155,23 @@ class Photograph:
         boxes = {n: (a * scale_x, b * scale_y, c * scale_x, d * scale_y) for n, (a, b, c, d) in self.boxes.items()}
         K = self.intrinsics * per_axis
         return replace(self, image=image, well_exposed=exposed, intrinsics=K, masks=masks, boxes=boxes)
+
+
+def check_shared(marked: Sequence[Set[str]], on_board: Sequence[bool]) -> None:
+    """Check that each of several photographs shows the board, or an object that another one shows as well.
+
+    Args:
+        marked: names of the objects that are marked in each.
+        on_board: whether each shows the board.
+
+    Raises:
+        InvalidInput: if one does not, so that nothing shows where it was taken.
+    """
+    for number, (names, is_on_board) in enumerate(zip(marked, on_board, strict=True)):
+        others = {name for k, its in enumerate(marked) if k != number for name in its}
+        if len(marked) > 1 and not is_on_board and not names & others:
+            allowed = "1, better 2 or more, as it shows no board: they show where it was taken"
+            raise InvalidInput(f"number of objects in photo {number + 1} that are marked in another, too", 0, allowed)
 
 
 def mask_box(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "4"]:

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int32
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from osfcore.errors import InvalidInput
@@ -393,6 +393,7 @@ _MARGIN = 0.4  # of the mask's longest side, on each side
 _MIN_PIXELS = 30  # of a mask in the photograph
 _LOOSE = 0.037  # of a side of the box that a person drew, on each side
 _LEAST_LEVEL = 1e-3
+_FAR_PX = 1e4  # from the border of a mask that is empty or fills its window
 _BINS, _BRIGHTEST, _BIN_SIGMA, _ANY_COLOUR = 24, 3.0, 0.7, 0.1  # of the histogram of colours around a box
 
 
@@ -543,8 +544,10 @@ def _frame(box: Float[np.ndarray, "4"], side: int) -> WindowFrame:
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """Return the distance from each pixel's centre to the border of a mask, positive inside [px]."""
-    inside, outside = np.asarray(distance_transform_edt(mask)), np.asarray(distance_transform_edt(~mask))
-    return np.where(mask, inside - 0.5, 0.5 - outside).astype(np.float32)
+    inside, outside = (
+        cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (mask, ~mask)
+    )
+    return np.clip(np.where(mask, inside - 0.5, 0.5 - outside), -_FAR_PX, _FAR_PX)
 
 
 # Prior on an object's pose over a known table: it probably stands on the table in one of its stable orientations.
@@ -621,7 +624,7 @@ LossKind = Literal["all", "iou"]
 Indices = Int32[np.ndarray, "B h w"]
 Depths = Float32[np.ndarray, "B h w"]
 _EXPLAINED, _CORRELATION, _MISFIT, _TABLE = 0.5, 0.5, 0.1, 1e-3  # weights
-_HALF_SIDE = 0.7  # of a surfel, in spacings
+_HALF_SIDE = 0.5  # of a surfel, in spacings
 
 
 @dataclass(frozen=True, eq=False, slots=True)

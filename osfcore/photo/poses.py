@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter, map_coordinates
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.estimation.camera_response import srgb_of_linear
@@ -28,7 +28,8 @@ from osfcore.geometry.poses import (
 )
 from osfcore.io.image_file import to_uint8
 from osfcore.photo.board import Intrinsics, camera_matrix
-from osfcore.photo.photograph import Photograph
+from osfcore.photo.photograph import Photograph, check_shared
+from osfcore.photo.placement import Shape, Sight, place_cameras
 from osfcore.photo.pose_loss import (
     LossKind,
     ObjectWindow,
@@ -68,7 +69,7 @@ Losses = Float[np.ndarray, "K"]
 _ITERATIONS = 20
 _DAMPING = 1e-4
 _MOST_TURN_RAD, _MOST_SHIFT = 0.1, 0.05  # of a step; the shift as a share of the distance
-_LEAST_TURN_RAD, _LEAST_SHIFT = 5e-4, 5e-5
+_LEAST_TURN_RAD, _LEAST_SHIFT = 2e-3, 2e-4
 _COLOUR_WEIGHT = 0.1  # of a surfel's colour: neighbours err together
 _FARTHEST_PX, _OUTLINE_STD_PX = 8.0, 1.0
 _HUBER, _TUKEY = 1.5, 4.0  # deviations at which residuals begin to count less, and nothing
@@ -121,6 +122,75 @@ def align(loss: PoseLoss, start: Pose) -> tuple[Pose, float]:
     return (pose if kept else start), float(terms.losses[kept])
 
 
+def align_together(
+    losses: Sequence[PoseLoss],
+    poses: Sequence[Pose],
+    cameras: Sequence[Pose],
+    views: Sequence[Sequence[int]],
+    free: set[int],
+) -> tuple[list[Pose], list[Pose]]:
+    """Refine the poses of objects and cameras together, by the same residuals as `align`.
+
+    A camera that is shifted by t and turned by w about c sees an object at p as if that were shifted by
+    -t + (p - c) x w and turned by -w, so that each window's normal equations serve for both.
+
+    Args:
+        losses: loss of each object, whose windows, surfels and table are used.
+        poses: of each object.
+        cameras: `T_world_camera` of each photograph.
+        views: for each object, which photograph each of its windows shows.
+        free: cameras that may move.
+
+    Returns:
+        Poses and cameras.
+    """
+    poses, cameras = list(poses), list(cameras)
+    prepared = [
+        [_prepare(w, loss.surfels, pose) for w in loss.windows] for loss, pose in zip(losses, poses, strict=True)
+    ]
+    place = {camera: np.s_[6 * k : 6 * k + 6] for k, camera in enumerate(sorted(free), len(poses))}
+    size = 6 * (len(poses) + len(free))
+    for _ in range(_ITERATIONS):
+        normal, right, centre = np.zeros((size, size)), np.zeros(size), np.mean([p.position for p in poses], axis=0)
+        for number, (loss, pose, parts) in enumerate(zip(losses, poses, prepared, strict=True)):
+            own = np.s_[6 * number : 6 * number + 6]
+            for part, view in zip(parts, views[number], strict=True):
+                window = replace(part.window, T_camera_world=cameras[view].inverse())
+                its_normal, its_right = _window_equations(replace(part, window=window), loss, pose)
+                jacobian = np.zeros((6, size))
+                jacobian[:, own] = np.eye(6)
+                if view in free:
+                    jacobian[:, place[view]] = -np.eye(6)
+                    jacobian[:3, place[view]][:, 3:] = _cross_matrix(pose.position - centre)
+                normal += jacobian.T @ its_normal @ jacobian
+                right += jacobian.T @ its_right
+            if loss.table is not None:
+                its_normal, its_right = loss.table.normal_equations(pose)
+                normal[own, own] += its_normal
+                right[own] += its_right
+        steps = np.linalg.solve(normal + np.diag(_DAMPING * np.diag(normal) + 1e-9), right).reshape(-1, 6)
+        farthest = _MOST_SHIFT * max(float(np.linalg.norm(camera.position - centre)) for camera in cameras)
+        steps[:, :3] *= np.minimum(1, farthest / np.maximum(np.linalg.norm(steps[:, :3], axis=1), 1e-12))[:, None]
+        steps[:, 3:] *= np.minimum(1, _MOST_TURN_RAD / np.maximum(np.linalg.norm(steps[:, 3:], axis=1), 1e-12))[:, None]
+        turns = quaternion_exp(steps[:, 3:])
+        for number, pose in enumerate(poses):
+            turned = quaternion_multiply(turns[number], pose.quaternion)
+            poses[number] = Pose(pose.position + steps[number, :3], turned)
+        for step, camera in enumerate(sorted(free), len(poses)):
+            before = cameras[camera]
+            position = centre + rotate(turns[step], before.position - centre) + steps[step, :3]
+            cameras[camera] = Pose(position, quaternion_multiply(turns[step], before.quaternion))
+        shifts, angles = (np.linalg.norm(each, axis=1).max() for each in (steps[:, :3], steps[:, 3:]))
+        if shifts < _LEAST_SHIFT * farthest / _MOST_SHIFT and angles < _LEAST_TURN_RAD:
+            break
+    return poses, cameras
+
+
+def _cross_matrix(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
 def _prepare(window: ObjectWindow, surfels: Surfels, start: Pose) -> _Prepared:
     depth = (window.T_camera_world @ start).position[2]
     sigma = max(0.5 * surfels.spacing * window.intrinsics[0, 0] / depth, 0.7)
@@ -137,17 +207,23 @@ def _gradient(image: np.ndarray) -> Pair:
 
 
 def _normal_equations(prepared: list[_Prepared], loss: PoseLoss, pose: Pose) -> Pair:
-    terms, std_px = [], _BORDER_STD_PX if loss.table is None else _BORDER_STD_ON_TABLE_PX
-    for part in prepared:
-        index, _ = draw(loss.surfels, part.window, pose[None])
-        terms.append(_outline_terms(part, loss.surfels, pose, index[0], std_px))
-        if loss.kind == "all":
-            terms.append(_colour_terms(part, loss.surfels, pose, index[0]))
-    normal, right = (np.sum([_CORRELATED * term[k] for term in terms], axis=0) for k in (0, 1))
+    parts = [_window_equations(part, loss, pose) for part in prepared]
+    normal, right = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
     if loss.table is None:
         return normal, right
     more_normal, more_right = loss.table.normal_equations(pose)
     return normal + more_normal, right + more_right
+
+
+def _window_equations(part: _Prepared, loss: PoseLoss, pose: Pose) -> Pair:
+    """Return the normal equations of one photograph."""
+    std_px = _BORDER_STD_PX if loss.table is None else _BORDER_STD_ON_TABLE_PX
+    index, _ = draw(loss.surfels, part.window, pose[None])
+    normal, right = _outline_terms(part, loss.surfels, pose, index[0], std_px)
+    if loss.kind == "all":
+        more_normal, more_right = _colour_terms(part, loss.surfels, pose, index[0])
+        normal, right = normal + more_normal, right + more_right
+    return _CORRELATED * normal, _CORRELATED * right
 
 
 def _colour_terms(part: _Prepared, surfels: Surfels, pose: Pose, index: np.ndarray) -> Pair:
@@ -244,6 +320,7 @@ _MOST_OFF, _MOTIONS_APART_DEG = 0.035, 14.0
 _PSI = 1.533751168755204288118041413  # the positive root of psi^4 = psi + 4
 _LATERAL_PX, _DEPTH_SHARE, _TURN_RAD = 2.0, 0.03, 0.15  # CMA's first spread
 _GENERATIONS, _POPULATION = 14, 14
+_CULLED_AT, _GOING_ON = 5, 8  # the generation after which only so many coarse searches go on
 _AROUND_LATERAL_M, _AROUND_DEPTH_SHARE, _AROUND_TURN_RAD = 0.015, 0.04, 0.25
 
 
@@ -306,11 +383,12 @@ def _largest(loss: PoseLoss) -> ObjectWindow:
 def _sides(surfels: Surfels, window: ObjectWindow, poses: Pose) -> Pair:
     """Return the least and the greatest coordinates of the outlines of B poses, B x 2 each [px]."""
     points = surfels.points[:: max(1, len(surfels.points) // _OUTLINED)].astype(np.float64)
+    points = points[ConvexHull(points).vertices]  # nothing else reaches a side
     local = window.T_camera_world @ poses
-    places = np.einsum("bij,sj->bsi", quaternion_to_matrix(local.quaternion), points) + local.position[:, None]
-    pixels = places @ window.intrinsics.T
-    pixels = pixels[..., :2] / np.maximum(pixels[..., 2:], _NEAREST_M)
-    return pixels.min(axis=1), pixels.max(axis=1)
+    matrices = window.intrinsics @ quaternion_to_matrix(local.quaternion)
+    pixels = matrices @ points.T + (local.position @ window.intrinsics.T)[..., None]
+    pixels = pixels[:, :2] / np.maximum(pixels[:, 2:], _NEAREST_M)
+    return pixels.min(axis=2), pixels.max(axis=2)
 
 
 def shape_symmetries(surfels: Surfels) -> Pose:
@@ -387,7 +465,7 @@ def distinct(poses: Pose, losses: Losses, count: int, least_deg: float) -> list[
     return kept
 
 
-def cma_search(loss: PoseLoss, starts: Pose, spread: float, rng: np.random.Generator) -> tuple[Pose, Losses]:
+def cma_search(loss: PoseLoss, starts: Pose, spread: float, rng: Rng, kept: int) -> tuple[Pose, Losses]:
     """Run one CMA-ES from each start; a generation of all is drawn as one batch.
 
     Args:
@@ -395,6 +473,7 @@ def cma_search(loss: PoseLoss, starts: Pose, spread: float, rng: np.random.Gener
         starts: K poses.
         spread: first standard deviation, as a multiple of 2 pixels sideways, 3 % of the depth and 0.15 rad.
         rng: random generator of the searches.
+        kept: how many searches go on after the fifth generation, the best ones.
 
     Returns:
         The best pose of each search and its loss.
@@ -406,16 +485,18 @@ def cma_search(loss: PoseLoss, starts: Pose, spread: float, rng: np.random.Gener
     scales = spread * np.stack([lateral, lateral, _DEPTH_SHARE * depths, *turns], axis=1)
     searches = [CMAES(np.ones(6), _POPULATION, rng) for _ in depths]
     position, quaternion = starts.position.copy(), starts.quaternion.copy()
-    least = loss(starts)
-    for _ in range(_GENERATIONS):
-        asked = [search.ask() for search in searches]
-        tried = Pose.joined(*(moved(starts[k], window, a * scales[k]) for k, a in enumerate(asked)))
-        losses = loss(tried).reshape(len(searches), _POPULATION)
-        for k, search in enumerate(searches):
-            search.tell(losses[k])
-            best = int(np.argmin(losses[k]))
-            if losses[k, best] < least[k]:
-                least[k], number = losses[k, best], k * _POPULATION + best
+    least, going = loss(starts), list(range(len(searches)))
+    for generation in range(_GENERATIONS):
+        if generation == _CULLED_AT:
+            going = [int(k) for k in np.argsort(least)[:kept]]
+        asked = [searches[k].ask() for k in going]
+        tried = Pose.joined(*(moved(starts[k], window, a * scales[k]) for k, a in zip(going, asked, strict=True)))
+        losses = loss(tried).reshape(len(going), _POPULATION)
+        for row, k in enumerate(going):
+            searches[k].tell(losses[row])
+            best = int(np.argmin(losses[row]))
+            if losses[row, best] < least[k]:
+                least[k], number = losses[row, best], row * _POPULATION + best
                 position[k], quaternion[k] = tried.position[number], tried.quaternion[number]
     return Pose(position, quaternion), least
 
@@ -516,49 +597,47 @@ class _FocalSearch:
         self._models, self._photo, self._found, self._config = models, photo, found, config
         self._costs: dict[float, float] = {}
 
-    def try_out(self, focal: float) -> None:
-        """Return the cost of a focal length [px]."""
+    def try_out(self, factor: float) -> None:
+        """Determine the cost of a focal length that is longer by a factor."""
         poses, losses = [], []
         for one in self._found:
-            pose, loss = self._aligned(one, one.best.pose, focal)
+            pose, loss = self._aligned(one, one.best.pose, factor)
             poses.append(pose)
             losses.append(loss)
         priors = [self._models.table_prior(one.name) for one in self._found]
         table = table_from_objects(priors, poses)
-        self._costs[focal] = sum(losses) + _NOT_ON_TABLE * len(poses)
+        self._costs[factor] = sum(losses) + _NOT_ON_TABLE * len(poses)
         if table is not None:
             placed = [(table.T_world_camera @ pose)[None] for pose in poses]
             off = sum(float(prior.penalties(pose)[0]) for prior, pose in zip(priors, placed, strict=True))
-            self._costs[focal] = sum(losses) + _ON_TABLE_WEIGHT * off
+            self._costs[factor] = sum(losses) + _ON_TABLE_WEIGHT * off
 
     def best(self) -> float | None:
-        """Return the focal length of least cost [px]; None if it is at an end of the grid, or no table was found."""
-        focals = np.array(sorted(self._costs))
-        costs = np.array([self._costs[focal] for focal in focals])
+        """Return the factor of least cost; None if it is at an end of the grid, or no table was found."""
+        factors = np.array(sorted(self._costs))
+        costs = np.array([self._costs[factor] for factor in factors])
         k = int(np.argmin(costs))
         if k in (0, len(costs) - 1) or costs[k] >= _NOT_ON_TABLE * len(self._found):
             return None
         left, middle, right = costs[k - 1 : k + 2]
         shift = 0.5 * (left - right) / max(left - 2 * middle + right, 1e-9)
-        return float(focals[k] * (focals[k + 1] / focals[k]) ** np.clip(shift, -0.5, 0.5))
+        return float(factors[k] * (factors[k + 1] / factors[k]) ** np.clip(shift, -0.5, 0.5))
 
-    def moved(self, one: PhotoObject, focal: float) -> PhotoObject:
+    def moved(self, one: PhotoObject, factor: float) -> PhotoObject:
         """Return an object with its poses for a camera of this focal length."""
-        poses = [replace(each, pose=self._aligned(one, each.pose, focal)[0]) for each in (one.best, *one.rivals)]
+        poses = [replace(each, pose=self._aligned(one, each.pose, factor)[0]) for each in (one.best, *one.rivals)]
         return replace(one, best=poses[0], rivals=tuple(poses[1:]))
 
-    def _aligned(self, one: PhotoObject, pose: Pose, focal: float) -> tuple[Pose, float]:
-        K = self._photo.intrinsics
-        return align(self._loss(one, focal, _FINE_SIDE), seen_through(pose, K, _with_focal(K, focal)))
-
-    def _loss(self, one: PhotoObject, focal: float, side: int) -> PoseLoss:
-        photo = replace(self._photo, intrinsics=_with_focal(self._photo.intrinsics, focal))
-        windows = object_windows([photo], one.name, side)
-        return PoseLoss(windows, self._models.surfels(one.name, FINE_ACROSS), kind=self._config.loss)
+    def _aligned(self, one: PhotoObject, pose: Pose, factor: float) -> tuple[Pose, float]:
+        photo = _with_focal(self._photo, factor)
+        windows = object_windows([photo], one.name, _FINE_SIDE)
+        loss = PoseLoss(windows, self._models.surfels(one.name, FINE_ACROSS), kind=self._config.loss)
+        return align(loss, seen_through(pose, self._photo.intrinsics, photo.intrinsics))
 
 
-def _with_focal(K: Intrinsics, focal: float) -> Intrinsics:
-    return camera_matrix(focal, float(K[0, 2]), float(K[1, 2]))
+def _with_focal(photo: Photograph, factor: float) -> Photograph:
+    K = photo.intrinsics
+    return replace(photo, intrinsics=camera_matrix(factor * float(K[0, 0]), float(K[0, 2]), float(K[1, 2])))
 
 
 def seen_through(pose: Pose, before: Intrinsics, after: Intrinsics) -> Pose:
@@ -681,28 +760,26 @@ class PhotoStep:
         progress: how far the work has come.
         found: objects found so far, in the photographs' world.
         table: table found from the objects if no photograph shows a board; only in the last step.
-        intrinsics: K with the focal length found from the objects, if it was unknown [px]; only in the last step.
+        photos: the photographs with the masks, cameras and focal length that were found. One of several that does not
+            fit the others has no masks; it was not used. Only in the last step.
+        focal_factor: by which focal lengths are longer than assumed; None if they were known or could not be found.
     """
 
     progress: Progress
     found: tuple[PhotoObject, ...]
     table: TableGuess | None = None
-    intrinsics: Intrinsics | None = None
+    photos: tuple[Photograph, ...] = ()
+    focal_factor: float | None = None
 
-    def as_seen(self, photo: Photograph, number: int = 0) -> Photograph:
-        """Return a photograph with the masks and the focal length that were found.
 
-        Args:
-            photo: as it was given.
-            number: which of the photographs it is.
-        """
-        masks = dict(photo.masks)
-        for found in self.found:
-            mask = found.masks[number] if found.masks else None
-            if found.name in masks and mask is not None:
-                masks[found.name] = mask
-        K = photo.intrinsics if self.intrinsics is None else self.intrinsics
-        return replace(photo, intrinsics=K, masks=masks)
+def _seen(photo: Photograph, found: Sequence[PhotoObject], number: int = 0) -> Photograph:
+    """Return photograph `number` with the masks that were found."""
+    masks = dict(photo.masks)
+    for each in found:
+        mask = each.masks[number] if each.masks else None
+        if each.name in masks and mask is not None:
+            masks[each.name] = mask
+    return replace(photo, masks=masks)
 
 
 # Reasons not to trust a pose in a photograph, one sentence each.
@@ -800,6 +877,7 @@ _KEPT, _APART_DEG = 6, 15.0
 _NEAR_DEG = 6.0  # between candidates around a given pose
 _TURNED, _COMPARED = 2, 5  # poses whose shape's symmetries are tried; poses that are refined in the finer window
 _ALIGNED = 3
+_MOST_NEARER, _DISTANCES = 0.08, 33  # share of the distance from the camera, and how many are tried
 _FEWEST_DRAWN = 60  # pixels of an outline from which a mask can be found
 _OFF_TABLE = 0.15  # of loss, by which an object must look better elsewhere than on the table that others stand on
 
@@ -884,48 +962,136 @@ def estimate_photo(
 
     Raises:
         UnknownName: if an object has no field.
-        InvalidInput: without photographs or masks, or with several photographs that do not share a table.
+        InvalidInput: without photographs or masks, or if a photograph without a board shares no object with others.
     """
     config = config or PhotoConfig()
-    on_table = [photo.on_table for photo in photos]
-    if not photos or not (all(on_table) or len(photos) == 1):
-        given = f"{len(photos)}, {sum(on_table)} of them with a known table"
-        raise InvalidInput("number of photos", given, "1, or more that all show the board on the table")
+    if not photos:
+        raise InvalidInput("number of photos", 0, "1 or more")
     for name in names:
         models.check(name)
         object_windows(photos, name, _COARSE_SIDE)
-    found: list[PhotoObject] = []
-    total = 2 * len(names) + 1
-    for number, name in enumerate(names):
-        yield PhotoStep(Progress(number, total, f"Looking for {name}"), tuple(found))
-        found.append(find_object(models, photos, name, rng, config))
-    intrinsics = None
+    on_table = all(photo.on_table for photo in photos)
+    check_shared([photo.masks.keys() for photo in photos], [photo.on_table for photo in photos])
+    groups = [photos] if on_table else [[photo] for photo in photos]
+    asked = [(k, name) for k, group in enumerate(groups) for name in names if any(name in p.masks for p in group)]
+    total, alone = len(asked) + len(names) + 1, [list[PhotoObject]() for _ in groups]
+    for done, (k, name) in enumerate(asked):
+        where = f" in photo {k + 1}" if len(groups) > 1 else ""
+        yield PhotoStep(Progress(done, total, f"Looking for {name}{where}"), tuple(alone[0]))
+        alone[k].append(find_object(models, groups[k], name, rng, config if k == 0 else replace(config, starts={})))
+    found, factor = alone[0], None
+    if len(groups) > 1:
+        yield PhotoStep(Progress(len(asked), total, "Comparing the photos"), tuple(found))
+        before, (photos, factor, tried) = photos[0], _placed(models, photos, alone, config)
+        T = photos[0].T_world_camera @ before.T_world_camera.inverse()
+        config = replace(config, starts={name: T @ pose for name, pose in config.starts.items()})
+        names = [name for name in names if any(name in photo.masks for photo in photos)]
+        found = [find_object(models, photos, name, rng, config, tried[name], is_placed=True) for name in names]
     fitting = [one for one in found if fits_outline(one.best)]
-    if not (on_table[0] or config.focal_known) and len(fitting) >= _FEWEST_OBJECTS:
-        seen = PhotoStep(Progress(0, 0, ""), tuple(found)).as_seen(photos[0])
-        search, total = _FocalSearch(models, seen, fitting, config), total + len(_FOCAL_FACTORS)
-        for done, factor in enumerate(_FOCAL_FACTORS, len(names)):
-            focal = factor * photos[0].intrinsics[0, 0]
+    if len(groups) == 1 and not (photos[0].on_table or config.focal_known) and len(fitting) >= _FEWEST_OBJECTS:
+        search = _FocalSearch(models, _seen(photos[0], found), fitting, config)
+        total = total + len(_FOCAL_FACTORS)
+        for done, guess in enumerate(_FOCAL_FACTORS, len(names)):
+            focal = guess * photos[0].intrinsics[0, 0]
             yield PhotoStep(Progress(done, total, f"Trying a focal length of {focal:.0f} pixels"), tuple(found))
-            search.try_out(focal)
-        if (focal := search.best()) is not None:
-            intrinsics = _with_focal(photos[0].intrinsics, focal)
-            found = [search.moved(one, focal) for one in found]
-            photos = [replace(photos[0], intrinsics=intrinsics)]
+            search.try_out(guess)
+        if (factor := search.best()) is not None:
+            found = [search.moved(one, factor) for one in found]
+            photos = [_with_focal(photos[0], factor)]
     table, T = None, Pose.identity()
-    if not on_table[0]:
+    if not any(photo.on_table for photo in photos):
         table = table_from_objects([models.table_prior(name) for name in names], [o.best.pose for o in found])
     if table is not None:
         T = table.T_world_camera
-        photos, found = [replace(photos[0], T_world_camera=T, on_table=True)], [_moved(one, T) for one in found]
+        photos = [replace(photo, T_world_camera=T @ photo.T_world_camera, on_table=True) for photo in photos]
+        found = [_moved(one, T) for one in found]
         config = replace(config, starts={name: T @ pose for name, pose in config.starts.items()})
     for number, name in enumerate(names):
         if len(names) > 1 and (table is not None or found[number].doubt):
             given = tuple(_moved(one, T.inverse()) for one in found)
             yield PhotoStep(Progress(total - len(names) + number - 1, total, f"Looking again for {name}"), given)
             found[number] = _found_again(models, photos, found, number, table, rng, config)
-    found = [_moved(one, T.inverse()) for one in found]
-    yield PhotoStep(Progress(total, total, "All objects were looked for"), tuple(found), table, intrinsics)
+    photos = [
+        _seen(
+            replace(
+                photo, T_world_camera=T.inverse() @ photo.T_world_camera, on_table=photo.on_table and table is None
+            ),
+            found,
+            number,
+        )
+        for number, photo in enumerate(photos)
+    ]
+    found = tuple(_moved(one, T.inverse()) for one in found)
+    yield PhotoStep(Progress(total, total, "All objects were looked for"), found, table, tuple(photos), factor)
+
+
+def _placed(
+    models: PhotoModels, photos: Photos, alone: Sequence[Sequence[PhotoObject]], config: PhotoConfig
+) -> tuple[list[Photograph], float | None, dict[str, Pose]]:
+    """Find where photographs were taken from the objects that they share.
+
+    Returns:
+        The photographs with their cameras, those that do not fit the others without masks; the factor of an unknown
+        focal length; and poses of each object that are worth a closer look.
+    """
+    sights = []
+    for photo, its in zip(photos, alone, strict=True):
+        each = {one.name: (one.best, *one.rivals) for one in its}
+        T = photo.T_world_camera.inverse()
+        sights.append(
+            {n: Sight(T @ Pose.stacked(p.pose for p in ps), np.array([p.score for p in ps])) for n, ps in each.items()}
+        )
+    names = {name for sight in sights for name in sight}
+    shapes = {name: Shape(models.surfels(name, COARSE_ACROSS).radius, models.symmetries(name)) for name in names}
+    on_table = any(photo.on_table for photo in photos)
+    known = [photo.T_world_camera if photo.on_table else None for photo in photos] if on_table else ()
+    focal_known = config.focal_known or on_table
+    placement = place_cameras(sights, shapes, known, focal_known=focal_known)
+    factor = None if focal_known else placement.focal_factor
+    placed = []
+    for photo, T, its in zip(photos, placement.cameras, alone, strict=True):
+        if T is None:
+            placed.append(photo.with_masks({}, {}))
+            continue
+        there = photo if factor is None else _with_focal(photo, factor)
+        placed.append(_seen(replace(there, T_world_camera=T, on_table=on_table), its))
+    agreed = sorted(placement.poses)
+    views = [[k for k in range(len(photos)) if (k, name) in placement.agreeing] for name in agreed]
+    losses = [
+        PoseLoss(
+            object_windows([placed[k] for k in its], name, _SHARP_SIDE),
+            models.surfels(name, FINE_ACROSS),
+            models.table_prior(name) if on_table else None,
+            config.loss,
+        )
+        for name, its in zip(agreed, views, strict=True)
+    ]
+    free = {
+        k for k, T in enumerate(placement.cameras) if T is not None and (k > 0 or on_table) and not photos[k].on_table
+    }
+    start = [Pose.identity() if T is None else T for T in placement.cameras]
+    poses, adjusted = align_together(losses, [placement.poses[name] for name in agreed], start, views, free)
+    if not on_table:  # sizes alone show how far away everything is; the world's origin is a camera
+        there = [T.inverse() for T in adjusted]
+        losses = [
+            replace(
+                loss, windows=tuple(replace(w, T_camera_world=there[k]) for w, k in zip(loss.windows, its, strict=True))
+            )
+            for loss, its in zip(losses, views, strict=True)
+        ]
+        nearness = _nearness(losses, poses)
+        poses, adjusted = ([Pose(nearness * T.position, T.quaternion) for T in each] for each in (poses, adjusted))
+    cameras = tuple(None if T is None else other for T, other in zip(placement.cameras, adjusted, strict=True))
+    tried = {name: [pose[None]] for name, pose in zip(agreed, poses, strict=True)}
+    for k, (photo, T, sight) in enumerate(zip(photos, cameras, sights, strict=True)):
+        if T is not None:
+            placed[k] = replace(placed[k], T_world_camera=T)
+            for name, its in sight.items():
+                seen = [
+                    seen_through(its.poses[j], photo.intrinsics, placed[k].intrinsics) for j in range(len(its.losses))
+                ]
+                tried.setdefault(name, []).append(T @ Pose.stacked(seen))
+    return placed, factor, {name: Pose.joined(*its) for name, its in tried.items()}
 
 
 def _moved(found: PhotoObject, T: Pose) -> PhotoObject:
@@ -999,10 +1165,10 @@ def find_object(
     if tried is None or not is_placed:
         poses = _candidates(models, coarse, name, rng, config, tried)
         middle = time.perf_counter()
-        poses, losses = cma_search(fine, poses, 0.35, rng)
-        poses = poses[distinct(poses, losses, _ALIGNED, _NEAR_DEG)]
+        poses, losses = cma_search(fine, poses, 0.35, rng, _ALIGNED)
     else:
-        poses = tried[:_ALIGNED]
+        poses, losses = tried, fine(tried)
+    poses = poses[distinct(poses, losses, _ALIGNED, _NEAR_DEG)]
     aligned = [_aligned(photos, fine, poses[k], name) for k in range(len(poses.position))]
     order = _ranked([pose for pose, _ in aligned], _APART_DEG)
     best, *rivals = (aligned[k][0] for k in order)
@@ -1028,7 +1194,7 @@ def _candidates(
         if tried is not None:
             candidates = Pose.joined(candidates, tried)
         ranked = candidates[distinct(candidates, coarse(candidates), _RANKED, _ALIKE_DEG)]
-    poses, losses = cma_search(coarse, ranked, 1.0, rng)
+    poses, losses = cma_search(coarse, ranked, 1.0, rng, _GOING_ON)
     poses = poses[distinct(poses, losses, _KEPT, apart)]
     if given is None:
         symmetries = models.symmetries(name)
@@ -1044,11 +1210,32 @@ def _aligned(photos: Photos, fine: PoseLoss, pose: Pose, name: str) -> tuple[Pho
     seen = [_masked(photo, name, fine.surfels, pose) for photo in photos]
     sharp = replace(fine, windows=object_windows(seen, name, _SHARP_SIDE))
     pose = align(sharp, pose)[0]
+    if fine.table is None and len(sharp.windows) == 1:
+        camera = sharp.windows[0].T_camera_world.inverse().position
+        pose = Pose(camera + _nearness([sharp], [pose]) * (pose.position - camera), pose.quaternion)
     terms = replace(fine, windows=object_windows(seen, name, _FINE_SIDE)).terms(pose[None])
     loss, iou, explained, correlation = (
         float(v[0]) for v in (terms.losses, terms.iou, terms.explained, terms.correlation)
     )
     return PhotoPose(pose, loss, iou, explained, correlation, print_match(sharp, pose)), seen
+
+
+def _nearness(losses: Sequence[PoseLoss], poses: Sequence[Pose]) -> float:
+    """Return the factor of all distances from the cameras at which the losses are least.
+
+    A mask that lacks parts of an object makes it look farther away. The loss sees that these look like the object.
+    """
+    factors, total = 1 + np.linspace(-_MOST_NEARER, _MOST_NEARER, _DISTANCES), np.zeros(_DISTANCES)
+    for loss, pose in zip(losses, poses, strict=True):
+        for window in loss.windows:
+            camera = window.T_camera_world.inverse().position
+            moved_ = camera + factors[:, None] * (pose.position - camera)
+            one = replace(loss, windows=(window,), table=None)
+            total += one(Pose(moved_, np.tile(pose.quaternion, (_DISTANCES, 1))))
+    k = int(np.clip(np.argmin(total), 1, _DISTANCES - 2))
+    left, middle, right = total[k - 1 : k + 2]
+    shift = float(np.clip(0.5 * (left - right) / max(left - 2 * middle + right, 1e-9), -1, 1))
+    return float(factors[k] + shift * (factors[1] - factors[0]))
 
 
 def _masked(photo: Photograph, name: str, surfels: Surfels, pose: Pose) -> Photograph:

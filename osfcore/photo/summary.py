@@ -32,33 +32,36 @@ from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, int
 # The summary of an estimation: poses on the table if it is known, lamp, camera, and notes for the user.
 
 
-def summarised(
-    photos: Sequence[Photograph], step: PhotoStep, models: PhotoModels, notes: Sequence[str], board: Board
-) -> FoundScene:
+def summarised(step: PhotoStep, models: PhotoModels, notes: Sequence[str], board: Board) -> FoundScene:
     """Summarise an estimation.
 
     Args:
-        photos: photos of one table.
         step: the last step of the estimation.
         models: models of the objects.
         notes: sentences for the user about the photo.
         board: that shows the table, if one is in view.
     """
-    T_table_world, table, notes = Pose.identity(), "board" if photos[0].on_table else None, list(notes)
+    T_table_world, table, notes = Pose.identity(), "board" if step.photos[0].on_table else None, list(notes)
     if step.table is not None:
         T_table_world, table = step.table.T_world_camera, "objects"
         seen = f"{len(step.table.supported)} objects, whose vertical axes differ by {step.table.spread_deg:.1f} degrees"
         notes.append(f"The table was found from {seen}; its tilt may be off by a few degrees.")
-    if step.intrinsics is not None:
-        focal = f"{step.intrinsics[0, 0]:.0f} pixels"
+    if step.focal_factor is not None:
+        focal = f"{step.photos[0].intrinsics[0, 0]:.0f} pixels"
         notes.append(f"The focal length, {focal}, was found from how the objects stand; it may be off by a fifth.")
+    used = [(number, photo) for number, photo in enumerate(step.photos, 1) if photo.masks]
+    if len(used) < len(step.photos):
+        unused = ", ".join(str(number) for number, photo in enumerate(step.photos, 1) if not photo.masks)
+        notes.append(
+            f"Not used: photo {unused}. Too few objects look alike in it and in the others; mark more of them."
+        )
     light = None
     try:
-        light, unknown = _light(photos, step, models, board)
+        light, unknown = _light([photo for _, photo in used], step, models, board)
         notes += unknown
     except InvalidInput as error:
         notes.append(f"The light could not be determined: {error}")
-    first, *others = [_camera(number, T_table_world, photo) for number, photo in enumerate(photos, 1)]
+    first, *others = [_camera(number, T_table_world, photo) for number, photo in used]
     objects = [_found(T_table_world, each) for each in step.found]
     return FoundScene(table=table, objects=objects, light=light, camera=first, other_cameras=others, notes=notes)
 
@@ -74,7 +77,7 @@ def _light(
     covered: tuple[float, float] | None = board.sheet_m
     if step.table is not None:
         place, covered = step.table.T_world_camera, None
-        photos = [replace(photos[0], T_world_camera=place, on_table=True)]
+        photos = [replace(photo, T_world_camera=place @ photo.T_world_camera, on_table=True) for photo in photos]
         found = [replace(each, best=replace(each.best, pose=place @ each.best.pose)) for each in found]
     fit = photo_lamp(photos, found, surfels, covered_m=covered)
     light = _found_light(fit)
@@ -126,7 +129,6 @@ class Located:
         source: source of the focal length.
         T_world_camera: pose over the board; None if there is none.
         notes: sentences for the user about photo and camera.
-        missing: why no board was found; "" if one was.
     """
 
     raw: RawPhotograph
@@ -135,7 +137,6 @@ class Located:
     source: FocalSource
     T_world_camera: Pose | None
     notes: tuple[str, ...]
-    missing: str = ""
 
     def straightened(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
         """Return a mask of the original photo without lens distortion."""
@@ -186,7 +187,7 @@ def locate(raw: RawPhotograph, focal_px: float | None, board: Board) -> Located:
             source = _guess_source(raw)
         notes.append("No printed board was found; the table is found from how the objects stand on it.")
         notes.append(f"If a board is in view: {error}")
-        return Located(raw, K, Lens(K), source, None, tuple(notes), str(error))
+        return Located(raw, K, Lens(K), source, None, tuple(notes))
     if lens.radial:
         bend = f"k1 = {lens.radial:.3f}, as the board shows"
         notes.append(f"The lens bends straight lines ({bend}); the photo was straightened.")
@@ -207,14 +208,13 @@ def locate_calibrated(raw: RawPhotograph, camera: KnownCamera, board: Board) -> 
     """
     lens = camera.lens_at(raw.sent_size).scaled(np.divide(raw.encoded.shape[1::-1], raw.sent_size))
     straight = replace(raw, encoded=lens.straightened(raw.encoded))
-    notes, pose, missing = [*raw.notes, "The camera is the one that was calibrated."], camera.T_world_camera, ""
+    notes, pose = [*raw.notes, "The camera is the one that was calibrated."], camera.T_world_camera
     if pose is None:
         try:
             pose = locate_board(straight.eight_bit, board, lens.intrinsics).T_world_camera
         except InvalidInput as error:
-            missing = str(error)
             notes.append(f"The calibration does not hold the camera's pose, and no board was found. {error}")
-    return Located(straight, lens.intrinsics, lens, "given", pose, tuple(notes), missing)
+    return Located(straight, lens.intrinsics, lens, "given", pose, tuple(notes))
 
 
 def _over_board(

@@ -100,10 +100,14 @@ function entry(object) {
   return item;
 }
 
+const togetherWith = () => [...byId("photo-together").querySelectorAll("input:checked")].map(({ value }) => value);
+
 function drawTogether() {
-  const others = photo.on_board ? photos.filter((other) => other.on_board && other.id !== photo.id) : [];
-  byId("photo-together").replaceChildren(...others.map((other) =>
-    el("label", { title: "Another photo of the same, unmoved objects and board" }, el("input", { type: "checkbox", value: other.id }), `together with ${other.name}`)));
+  const shared = ({ on_board, marked }) => (photo.on_board && on_board) || photo.objects.some(({ name }) => marked.includes(name));
+  const others = photos.filter((other) => other.id !== photo.id && shared(other));
+  const taken = new Set(togetherWith());
+  byId("photo-together").replaceChildren(...others.map(({ id, name }) =>
+    el("label", { title: "Another photo of the same objects, none of which was moved" }, el("input", { type: "checkbox", value: id, checked: taken.has(id) }), `together with ${name}`)));
 }
 
 function drawResult() {
@@ -245,8 +249,7 @@ function inTurn(work) {
 
 /** Begins the search for what is marked. */
 export async function findObjects() {
-  const together = [...byId("photo-together").querySelectorAll("input:checked")].map(({ value }) => value);
-  show(await post(path("/find"), { together, seed: 0 }));
+  show(await post(path("/find"), { together: togetherWith(), seed: 0 }));
 }
 
 async function make(what) {

@@ -110,12 +110,11 @@ def photo_job(params: PhotoParams, place: JobContext) -> Iterator[Finding]:
     for step in estimate_photo(models, photos, names, rng, config):
         yield Finding(step.progress.done, step.progress.total + 1, step.progress.note, len(step.found))
     assert step is not None
-    photos = [step.as_seen(photo, number) for number, photo in enumerate(photos)]
     yield Finding(step.progress.total, step.progress.total + 1, "The lamp", len(step.found))
-    write_json(place.folder / FOUND, encode(summarised(photos, step, models, params.notes, board_of(params.board))))
+    write_json(place.folder / FOUND, encode(summarised(step, models, params.notes, board_of(params.board))))
     for found in step.found:
-        if found.name in photos[0].masks:
-            _draw_sheets(place.folder, models, photos[0], found)
+        if found.name in step.photos[0].masks:
+            _draw_sheets(place.folder, models, step.photos[0], found)
     yield Finding(step.progress.total + 1, step.progress.total + 1, "Done", len(step.found))
 
 

@@ -126,13 +126,13 @@ def test_an_absurd_focal_length_is_told(photo, tmp_path, capsys, focal):
     assert "focal length [px] is" in error
 
 
-def test_two_photos_without_a_board_are_told(photo, tmp_path, capsys):
+def test_two_photos_that_share_neither_board_nor_object_are_told(photo, tmp_path, capsys):
     error = refusal(
         capsys, tmp_path, "--photo", str(photo), str(photo), "--boxes", BOX.replace(NAME, f"photo.png:{NAME}")
     )
     assert "photo of a box is photo.png" in error  # which of the two?
     error = refusal(capsys, tmp_path, "--photo", str(photo), str(photo), "--boxes", BOX)
-    assert "board in photo.png is missing" in error
+    assert "objects in photo 1 that are marked in another, too, is 0" in error
 
 
 def test_files_of_other_programs_that_do_not_fit_are_told(photo, tmp_path, capsys):
