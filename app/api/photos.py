@@ -172,6 +172,7 @@ class ObjectFound(BaseModel):
 
     poses: list[PoseFound] = Field(description="The most likely first.")
     doubt: str = Field(description="Why it should not be trusted, a sentence; empty where it may be.")
+    outline: list[list[list[float]]] = Field(description="Polygons around its mask, as it was found with the pose.")
 
 
 class MarkedOut(BaseModel):
@@ -183,7 +184,9 @@ class MarkedOut(BaseModel):
     on: list[list[float]]
     off: list[list[float]]
     strokes: list[StrokeIn]
-    outline: list[list[list[float]]] = Field(description="Closed polygons around its mask and around holes in it.")
+    outline: list[list[list[float]]] = Field(
+        description="Closed polygons around the first mask and its holes."
+    )
     doubt: str = Field(description="A sentence if the outline does not fill its box; empty if it does.")
     choice: int | None = Field(description="The pose that a person took; null before that.")
     found: ObjectFound | None
@@ -264,7 +267,7 @@ def _found(job: Job, found: FoundObject) -> ObjectFound:
         file = sheet_name(found.name, number)
         picture = f"/api/jobs/{job.id}/files/{file}" if file in job.files else None
         poses.append(PoseFound(**pose.model_dump(include=set(FoundPose.model_fields)), picture=picture))
-    return ObjectFound(poses=poses, doubt=found.doubt)
+    return ObjectFound(poses=poses, doubt=found.doubt, outline=found.outline)
 
 
 def _marked(marked: MarkedObject, label: str, found: ObjectFound | None) -> MarkedOut:

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 _MEMORY_BYTES = 3 << 29  # sound photos take two thirds of it
 _JPEG_QUALITY = 95
-_OUTLINE_PX = 0.7  # by which the outline that is drawn may differ from the mask's
 
 
 class PhotoRefused(OsfError):
@@ -96,18 +95,15 @@ def _encoded(kind: str, picture: np.ndarray, options: list[int] | None = None) -
 
 
 def _mask(order: FindMask) -> MaskFound:
-    from osfcore.photo.segmentation import outline_doubt, propose_mask
+    from osfcore.photo.segmentation import outline_doubt, outline_of, propose_mask
 
     picture, mark = cv2.imdecode(np.frombuffer(order.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB), order.mark
     assert picture is not None
     add, remove = _painted(mark, picture.shape[:2])
     clicks = (np.reshape(np.array(points, float), (-1, 2)) for points in (mark.on, mark.off))
     mask = propose_mask(picture, mark.box, *clicks, add=add, remove=remove)
-    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    plain = [cv2.approxPolyDP(line, _OUTLINE_PX, True)[:, 0] + 0.5 for line in outlines]
-    polygons = tuple(tuple((float(x), float(y)) for x, y in line) for line in plain if len(line) > 2)
     doubt = "" if mark.strokes else outline_doubt("the object", mark.box, mask)  # what is painted was judged by eye
-    return MaskFound(encode_png(np.where(mask, 255, 0).astype(np.uint8)), polygons, doubt)
+    return MaskFound(encode_png(np.where(mask, 255, 0).astype(np.uint8)), outline_of(mask), doubt)
 
 
 def _painted(mark: Mark, shape: tuple[int, int]) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:

@@ -1,10 +1,10 @@
 """Draw photographs of tables whose poses are known: scans under a hard lamp, through a phone's lens, sensor and JPEG.
 
-Six objects lie on a wooden or plain table; two of them are clutter that nobody marks. The camera stands anywhere in
-front of the table, as a person would hold it. The picture is blurred, exposed, balanced and given the tone curve of a
-phone, which the estimation takes for sRGB; then come noise and JPEG. Further photographs of a table are taken from
-other places with the same lens. Folders are written as `osfcore.experiments.photos` reads them, without depth. Masks
-are exact.
+Six objects, or as many as there are, lie on a wooden or plain table; two of them are clutter that nobody marks. The
+camera stands anywhere in front of the table, as a person would hold it. The picture is blurred, exposed, balanced and
+given the tone curve of a phone, which the estimation takes for sRGB; then come noise and JPEG. Further photographs of a
+table are taken from other places with the same lens. Folders are written as `osfcore.experiments.photos` reads them,
+without depth. Masks are exact.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ def write_drawn_table(library: AssetLibrary, folder: Path, seed: int, number: in
     first, conditions = _Place.drawn(rng), Conditions(lamp=lamp, table=table)
     hands = [rng, *(stream_rng(seed, Stream.DRAWN_PHOTO, number, view) for view in range(1, views))]
     cameras = tuple((first.beside(hand) if k else first).camera(f"photo{k}") for k, hand in enumerate(hands))
-    request = SceneRequest(count=_OBJECTS)
+    count = min(_OBJECTS, len(library.names()))
+    request = SceneRequest(count=count)
     with closing(Tabletop(library, cameras=cameras, request=request, conditions=conditions)) as world:
         world.arrange(stream_seed(seed, Stream.DRAWN_PHOTO, number))
         seen, truth = world.render(cameras, masks=True, with_pusher=False), world.truth()
@@ -92,7 +93,7 @@ def write_drawn_table(library: AssetLibrary, folder: Path, seed: int, number: in
             place / "photo.jpg", quality=int(hand.integers(*_QUALITY)), subsampling=2
         )
         marked = {}
-        for k, name in enumerate(truth.names[: _OBJECTS - _CLUTTER]):
+        for k, name in enumerate(truth.names[: max(count - _CLUTTER, 1)]):
             mask = seen.masks[view, k]
             if mask.sum() >= _FEWEST and not (mask[[0, -1]].any() or mask[:, [0, -1]].any()):
                 cv2.imwrite(str(place / f"mask_{name}.png"), 255 * mask.astype(np.uint8))

@@ -55,6 +55,7 @@ def _whole_characters(text: str) -> str:
 
 
 Text = Annotated[str, AfterValidator(_whole_characters)]
+Vector2 = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2), _as_a_whole("2 finite numbers")]
 Vector3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3), _as_a_whole("3 finite numbers")]
 Vector4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4), _as_a_whole("4 finite numbers")]
 Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3), _as_a_whole("3 x 3 finite numbers")]

@@ -1,12 +1,13 @@
 """The contents of a photograph as JSON, in the table's frame if the table is known, else in the camera's frame.
 
     {"table": "board" | "objects" | null,
-     "objects": [{"name", "position": [3], "quaternion": [w, x, y, z], "loss", "iou", "doubt",
+     "objects": [{"name", "position": [3], "quaternion": [w, x, y, z], "loss", "iou", "doubt", "outline",
                   "rivals": [{"position", "quaternion", "loss", "iou"}]}],
      "light": {"direction": [3], "std_deg", "diffuse", "distance_m", "distance_std_m"},
      "camera": {"name", "T_world_camera": 4x4, "K": 3x3, "width", "height"}, "other_cameras": [...], "notes": [...]}
 
-"table" names what the table was found from. "light" is null if too few pixels show objects.
+"table" names what the table was found from. "light" is null if too few pixels show objects. "outline" is of the mask in
+the first photo, as it was found.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from osfcore.geometry.poses import Pose
-from osfcore.io.json_codec import Entry, Text, Vector3, Vector4
+from osfcore.io.json_codec import Entry, Text, Vector2, Vector3, Vector4
 from osfcore.io.scene_file import CameraJson
 
 TableSource = Literal["board", "objects"]
@@ -42,6 +43,9 @@ class FoundObject(FoundPose):
     name: Text
     doubt: str = Field(description="Why the pose should not be trusted, in one sentence; empty if it can be.")
     rivals: list[FoundPose] = Field(description="Other orientations that explain the photo, the best first.")
+    outline: list[list[Vector2]] = Field(
+        [], description="Closed polygons around its mask as it was found with the pose, in the first photo [px]."
+    )
 
     def poses(self) -> tuple[FoundPose, ...]:
         """Return the best pose, then its rivals."""

@@ -170,8 +170,8 @@ def check_shared(marked: Sequence[Set[str]], on_board: Sequence[bool]) -> None:
     for number, (names, is_on_board) in enumerate(zip(marked, on_board, strict=True)):
         others = {name for k, its in enumerate(marked) if k != number for name in its}
         if len(marked) > 1 and not is_on_board and not names & others:
-            allowed = "1, better 2 or more, as it shows no board: they show where it was taken"
-            raise InvalidInput(f"number of objects in photo {number + 1} that are marked in another, too", 0, allowed)
+            what, allowed = f"number of objects marked both in photo {number + 1} and in another", "1 or more, better 2"
+            raise InvalidInput(what, 0, f"{allowed}: without a board in view, they show where it was taken")
 
 
 def mask_box(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "4"]:

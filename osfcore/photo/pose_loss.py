@@ -624,7 +624,7 @@ LossKind = Literal["all", "iou"]
 Indices = Int32[np.ndarray, "B h w"]
 Depths = Float32[np.ndarray, "B h w"]
 _EXPLAINED, _CORRELATION, _MISFIT, _TABLE = 0.5, 0.5, 0.1, 1e-3  # weights
-_HALF_SIDE = 0.5  # of a surfel, in spacings
+_HALF_SIDE = 0.6  # of a surfel, in spacings: at 0.7 outlines are 0.4 % too wide, at 0.5 drawings have holes
 
 
 @dataclass(frozen=True, eq=False, slots=True)

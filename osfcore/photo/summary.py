@@ -28,6 +28,7 @@ from osfcore.photo.lens import Lens
 from osfcore.photo.photograph import Box, Photograph, mask_box
 from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, PhotoPose, PhotoStep
 from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, intrinsics_from_focal
+from osfcore.photo.segmentation import outline_of
 
 # The summary of an estimation: poses on the table if it is known, lamp, camera, and notes for the user.
 
@@ -62,7 +63,7 @@ def summarised(step: PhotoStep, models: PhotoModels, notes: Sequence[str], board
     except InvalidInput as error:
         notes.append(f"The light could not be determined: {error}")
     first, *others = [_camera(number, T_table_world, photo) for number, photo in used]
-    objects = [_found(T_table_world, each) for each in step.found]
+    objects = [_found(T_table_world, each, used[0][1]) for each in step.found]
     return FoundScene(table=table, objects=objects, light=light, camera=first, other_cameras=others, notes=notes)
 
 
@@ -101,14 +102,16 @@ def _camera(number: int, T_table_world: Pose, photo: Photograph) -> CameraJson:
     return CameraJson(name=f"photo {number}", T_world_camera=T_table_camera, K=K, **size)
 
 
-def _found(T_table_world: Pose, found: PhotoObject) -> FoundObject:
+def _found(T_table_world: Pose, found: PhotoObject, photo: Photograph) -> FoundObject:
     def entry(pose: PhotoPose) -> FoundPose:
         there = T_table_world @ pose.pose
         position, quaternion = there.position.tolist(), there.quaternion.tolist()
         return FoundPose(position=position, quaternion=quaternion, loss=pose.loss, iou=pose.iou)
 
     best, rivals = entry(found.best), [entry(pose) for pose in found.rivals]
-    return FoundObject(**best.model_dump(), name=found.name, doubt=found.doubt, rivals=rivals)
+    polygons = outline_of(photo.masks[found.name]) if found.name in photo.masks else ()
+    outline = [[list(point) for point in polygon] for polygon in polygons]
+    return FoundObject(**best.model_dump(), name=found.name, doubt=found.doubt, rivals=rivals, outline=outline)
 
 
 # The camera of a decoded photograph: over a printed board if it shows one, else from the file.

@@ -38,7 +38,8 @@ function marksOf(object) {
   const [left, top] = object.box;
   const name = svg("text", { x: left + 4 * unit(), y: Math.max(top - 6 * unit(), 16 * unit()), class: "photo-name", "font-size": 14 * unit() });
   name.textContent = object.label;
-  const outline = svg("path", { d: object.outline.map(polygon).join(""), class: `photo-outline${isChosen ? " chosen" : ""}` });
+  const shown = object.found?.outline.length ? object.found.outline : object.outline;
+  const outline = svg("path", { d: shown.map(polygon).join(""), class: `photo-outline${isChosen ? " chosen" : ""}` });
   if (!isChosen) return [outline, name];
   const clicks = [...object.on.map((p) => [p, "on"]), ...object.off.map((p) => [p, "off"])].map(([[x, y], kind]) =>
     svg("circle", { cx: x, cy: y, r: 5 * unit(), class: `photo-click ${kind}` }));

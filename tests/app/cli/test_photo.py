@@ -132,7 +132,7 @@ def test_two_photos_that_share_neither_board_nor_object_are_told(photo, tmp_path
     )
     assert "photo of a box is photo.png" in error  # which of the two?
     error = refusal(capsys, tmp_path, "--photo", str(photo), str(photo), "--boxes", BOX)
-    assert "objects in photo 1 that are marked in another, too, is 0" in error
+    assert "objects marked both in photo 1 and in another is 0" in error
 
 
 def test_files_of_other_programs_that_do_not_fit_are_told(photo, tmp_path, capsys):

@@ -121,7 +121,7 @@ def test_objects_without_a_field_and_photos_without_a_common_object_are_refused(
     with pytest.raises(UnknownName, check=about("teapot")):
         found_in(models, photo, "teapot")
     other = replace(taken.photo, masks={BOTTLE: taken.photo.masks[NAME]})
-    for photos, what in (([taken.photo, other], "number of objects in photo 1"), ([], "number of photos")):
+    for photos, what in (([taken.photo, other], "number of objects marked both in photo 1"), ([], "number of photos")):
         with pytest.raises(InvalidInput, check=about(what)):
             next(estimate_photo(models, photos, [NAME], np.random.default_rng(0)))
 
