@@ -184,9 +184,7 @@ class MarkedOut(BaseModel):
     on: list[list[float]]
     off: list[list[float]]
     strokes: list[StrokeIn]
-    outline: list[list[list[float]]] = Field(
-        description="Closed polygons around the first mask and its holes."
-    )
+    outline: list[list[list[float]]] = Field(description="Closed polygons around the first mask and its holes.")
     doubt: str = Field(description="A sentence if the outline does not fill its box; empty if it does.")
     choice: int | None = Field(description="The pose that a person took; null before that.")
     found: ObjectFound | None

@@ -1,8 +1,8 @@
 """The contents of a photograph as JSON, in the table's frame if the table is known, else in the camera's frame.
 
     {"table": "board" | "objects" | null,
-     "objects": [{"name", "position": [3], "quaternion": [w, x, y, z], "loss", "iou", "doubt", "outline",
-                  "rivals": [{"position", "quaternion", "loss", "iou"}]}],
+     "objects": [{"name", "position": [3], "quaternion": [w, x, y, z], "loss", "iou", "probability", "doubt",
+                  "outline", "rivals": [{"position", "quaternion", "loss", "iou", "probability"}]}],
      "light": {"direction": [3], "std_deg", "diffuse", "distance_m", "distance_std_m"},
      "camera": {"name", "T_world_camera": 4x4, "K": 3x3, "width", "height"}, "other_cameras": [...], "notes": [...]}
 
@@ -31,6 +31,7 @@ class FoundPose(Entry):
     quaternion: Vector4 = Field(description="Unit quaternion (w, x, y, z).")
     loss: float = Field(description="Loss of outline, shading and texture; lower is better.")
     iou: float = Field(description="Intersection over union of outline and mask; 1 if they agree.")
+    probability: float | None = Field(None, description="That the object is turned like this, within 10 degrees.")
 
     def pose(self) -> Pose:
         """Return the pose."""

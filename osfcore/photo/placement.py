@@ -36,7 +36,7 @@ _POINT_STD = 0.02  # of a point in a photograph [radii of the object]
 _FARTHEST = 4.0  # deviations of a point, in the mean over an object, with which it still agrees
 _FOCAL_STD = 0.3  # of the logarithm of an assumed focal length
 _POINT_STD_TURNED = 0.08  # the same, turned by one of a few symmetries of a round object
-_ROUNDS, _EVALUATIONS, _TOLERANCE, _STEP = 2, 30, 1e-4, 1e-7
+_EVALUATIONS, _TOLERANCE, _STEP = 30, 1e-4, 1e-7
 _NEAREST_M = 1e-3
 _CORNERS = np.array(list(itertools.product((-1, 1), repeat=3))) / np.sqrt(3)
 
@@ -155,6 +155,7 @@ class _Problem:
         focal_known: bool,
     ) -> None:
         self._sights, self._shapes, self._fixed, self._focal_known = sights, shapes, fixed, focal_known
+        self._turned = [{name: _turned(its, shapes[name]) for name, its in sight.items()} for sight in sights]
 
     def anchor(self) -> int:
         """Return the first of the two photographs whose objects agree best."""
@@ -204,61 +205,71 @@ class _Problem:
         """Return the poses that agree in these cameras, the cost of a consensus, and where the objects then are."""
         matches, total, poses = [], 0.0, {}
         for name, shape in self._shapes.items():
-            seen = [
-                (k, c, s[name]) for k, (c, s) in enumerate(zip(cameras, self._sights, strict=True)) if c and name in s
-            ]
+            seen = {k: self._turned[k][name] for k, camera in enumerate(cameras) if camera and name in self._turned[k]}
             if len(seen) < 2:
                 continue
-            best = np.inf
-            turned = [
-                Pose.joined(*(camera @ sight.poses[b] @ shape.symmetries for b in range(len(sight.poses.position))))
-                for _, camera, sight in seen
-            ]
-            extra = [_penalties(sight, len(shape.symmetries.position)) for *_, sight in seen]
-            for anchor, (_, camera, sight) in enumerate(seen):
-                for a, pose in enumerate(_each(camera @ sight.poses)):
-                    cost, chosen = float(extra[anchor][a * len(shape.symmetries.position)]), [(anchor, a, False)]
-                    for other in range(len(seen)):
-                        if other != anchor:
-                            costs = _apart(pose, turned[other]) + extra[other]
-                            least = int(np.argmin(costs))
-                            cost += min(float(costs[least]), _MOST_COST)
-                            if costs[least] < _MOST_COST:
-                                chosen.append((other, least, True))
-                    if cost < best:
-                        best, kept, where = cost, chosen, pose
-            total += best
-            if len(kept) > 1:
+            count = len(shape.symmetries.position)
+            there = {k: camera @ seen[k][0] for k, camera in enumerate(cameras) if camera and k in seen}
+            unturned = [(k, n) for k, (its, _) in seen.items() for n in range(0, len(its.position), count)]
+            tried = [(*_agreement(there, seen, k, n), there[k][n]) for k, n in unturned]
+            cost, agreeing, where = min(tried, key=lambda each: each[0])
+            total += cost
+            if len(agreeing) > 1:
                 poses[name] = where
-                count = len(shape.symmetries.position)
-                for other, number, is_variant in kept:
-                    k, _, sight = seen[other]
-                    b, s = divmod(number, count) if is_variant else (number, 0)
-                    matches.append(_Match(k, name, sight.poses[b] @ shape.symmetries[s], s > 0))
+                matches += [_Match(k, name, seen[k][0][n], n % count > 0) for k, n in agreeing.items()]
         return matches, total, poses
 
     def adjusted(self, cameras: Sequence[Pose | None]) -> tuple[float, Placement]:
-        """Adjust cameras and poses; return the cost and the result."""
-        factor, count = 1.0, len(cameras)
+        """Match and adjust twice; return the cost and the result."""
+        _, placement = self._bundled(cameras, 1.0)
+        return self._bundled(placement.cameras, placement.focal_factor)
+
+    def _bundled(self, cameras: Sequence[Pose | None], factor: float) -> tuple[float, Placement]:
+        matches, _, poses = self._matched(cameras)
+        if not matches:
+            return np.inf, Placement(tuple(cameras), {})
+        names, count = sorted(poses), len(cameras)
         free = [k for k, camera in enumerate(cameras) if camera is not None and k not in self._fixed]
-        for _ in range(_ROUNDS):
-            matches, _, poses = self._matched(cameras)
-            names = sorted(poses)
-            bundle = _Bundle(self._shapes, matches, names, count)
-            places = Pose.stacked([*(camera or Pose.identity() for camera in cameras), *(poses[n] for n in names)])
-            after, factor = bundle.adjusted(
-                places, [*free, *range(count, count + len(names))], factor, self._focal_known
-            )
-            cameras = [None if camera is None else after[k] for k, camera in enumerate(cameras)]
-            poses = {name: after[k] for k, name in enumerate(names, count)}
+        bundle = _Bundle(self._shapes, matches, names, count)
+        places = Pose.stacked([*(camera or Pose.identity() for camera in cameras), *(poses[name] for name in names)])
+        moving = [*free, *range(count, count + len(names))]
+        after, factor = bundle.adjusted(places, moving, factor, self._focal_known)
         off = np.linalg.norm(bundle.off(after, factor), axis=-1).mean(axis=1)
-        agreeing = frozenset((m.photo, m.name) for m, its in zip(matches, off, strict=True) if its < _FARTHEST)
-        counts = Counter(name for _, name in agreeing)
-        poses = {name: pose for name, pose in poses.items() if counts[name] > 1}
-        agreeing = frozenset(each for each in agreeing if each[1] in poses)
+        near = [(m.photo, m.name) for m, its in zip(matches, off, strict=True) if its < _FARTHEST]
+        counts = Counter(name for _, name in near)
+        agreeing = frozenset(each for each in near if counts[each[1]] > 1)
+        poses = {name: after[k] for k, name in enumerate(names, count) if counts[name] > 1}
         shared = sum(len(s) for s, camera in zip(self._sights, cameras, strict=True) if camera is not None)
         cost = float(np.minimum(off, _FARTHEST).sum()) + _FARTHEST * (shared - len(off))
-        return cost, Placement(tuple(cameras), poses, agreeing, factor)
+        moved = tuple(None if camera is None else after[k] for k, camera in enumerate(cameras))
+        return cost, Placement(moved, poses, agreeing, factor)
+
+
+_Turned = tuple[Pose, Float[np.ndarray, "K"]]  # poses before a camera, each turned by all symmetries, and their costs
+
+
+def _turned(sight: Sight, shape: Shape) -> _Turned:
+    poses = Pose.joined(*(sight.poses[k] @ shape.symmetries for k in range(len(sight.losses))))
+    turned = np.where(np.arange(len(shape.symmetries.position)) > 0, _TURNED_COST, 0.0)
+    worse = np.clip((sight.losses - sight.losses[0]) / _LOSS_STD, 0, _MOST_COST)
+    return poses, (worse[:, None] + turned).ravel()
+
+
+def _agreement(
+    there: Mapping[int, Pose], seen: Mapping[int, _Turned], anchor: int, number: int
+) -> tuple[float, dict[int, int]]:
+    """Return the cost at which others agree with one pose, and the numbers of the poses of those that do."""
+    pose, cost, agreeing = there[anchor][number], float(seen[anchor][1][number]), {anchor: number}
+    for k, its in there.items():
+        if k != anchor:
+            shifts = np.linalg.norm(its.position - pose.position, axis=-1) / _POSITION_STD_M
+            turns = rotation_angle(its.quaternion, pose.quaternion) / _ROTATION_STD_RAD
+            costs = shifts**2 + turns**2 + seen[k][1]
+            least = int(np.argmin(costs))
+            cost += min(float(costs[least]), _MOST_COST)
+            if costs[least] < _MOST_COST:
+                agreeing[k] = least
+    return cost, agreeing
 
 
 class _Bundle:
@@ -299,7 +310,7 @@ class _Bundle:
 
         found = least_squares(
             residuals, start, jacobian, loss="soft_l1", x_scale="jac", ftol=_TOLERANCE, max_nfev=_EVALUATIONS
-        )
+        )  # pyright: ignore[reportArgumentType] - its stubs do not know of derivatives by a function
         after, log_focal = unpacked(found.x)
         return after, float(np.exp(log_focal.sum()))
 
@@ -312,19 +323,3 @@ class _Bundle:
 
 def _projected(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
     return points[..., :2] / np.maximum(points[..., 2:], _NEAREST_M)
-
-
-def _each(poses: Pose) -> list[Pose]:
-    return [poses[k] for k in range(len(poses.position))]
-
-
-def _penalties(sight: Sight, symmetries: int) -> Float[np.ndarray, "K"]:
-    """Return what each pose of an object, turned by each symmetry, costs by itself."""
-    turned = np.where(np.arange(symmetries) > 0, _TURNED_COST, 0.0)
-    own = (sight.losses - sight.losses[0]) / _LOSS_STD
-    return (np.clip(own, 0, _MOST_COST)[:, None] + turned).ravel()
-
-
-def _apart(pose: Pose, others: Pose) -> Float[np.ndarray, "K"]:
-    shift = np.linalg.norm(others.position - pose.position, axis=-1) / _POSITION_STD_M
-    return shift**2 + (rotation_angle(others.quaternion, pose.quaternion) / _ROTATION_STD_RAD) ** 2

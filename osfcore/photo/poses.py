@@ -751,6 +751,11 @@ class PhotoObject:
     refine_s: float
     masks: tuple[Bool[np.ndarray, "h w"] | None, ...] = ()
 
+    @property
+    def probabilities(self) -> Float[np.ndarray, "K"]:
+        """How probable it is that the object is turned as in the best pose, and in each rival, see `probabilities`."""
+        return probabilities((self.best, *self.rivals))
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PhotoStep:
@@ -782,14 +787,33 @@ def _seen(photo: Photograph, found: Sequence[PhotoObject], number: int = 0) -> P
     return replace(photo, masks=masks)
 
 
-# Reasons not to trust a pose in a photograph, one sentence each.
+# Reasons not to trust a pose in a photograph, one sentence each; and how probable orientations are.
+#
+# With scores s_k of the poses that were found, the best first, and the print m that is found of the best,
+#
+#     p_k = w_k / (w_none + sum_j w_j),    w_k = exp((s_0 - s_k) / T),    w_none = exp(a - b m),
+#
+# where "none" stands for an orientation that was not found. T, a and b maximise the likelihood of which poses were
+# right on drawn tables and photographs that nothing else is reported on.
 
 
 _PRINT = 0.6  # weight of the print that is found again
-LEAST_MARGIN = 0.09  # by which another orientation scores worse
+_TEMPERATURE, _UNSEEN, _PRINTED = 0.1, 0.0, 3.0  # T, a, b
+_LEAST_PROBABLE = 0.6  # of a pose that is trusted
 _LEAST_IOU = 0.85
 _LEAST_EXPLAINED, _LEAST_MATCH = 0.1, 0.5  # one of them is enough
 _MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
+
+
+def probabilities(poses: Sequence[PhotoPose]) -> Float[np.ndarray, "K"]:
+    """Return how probable it is that an object is turned as in each of its poses, within 10 degrees.
+
+    Args:
+        poses: that were found, the best first. What is missing to 1 is the probability of another orientation.
+    """
+    scores = np.array([pose.score for pose in poses])
+    weights = np.exp(np.minimum(scores[0] - scores, 0) / _TEMPERATURE)
+    return weights / (weights.sum() + np.exp(_UNSEEN - _PRINTED * poses[0].match))
 
 
 def fits_outline(best: PhotoPose) -> bool:
@@ -811,8 +835,11 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
         return f"The outline of {name} does not fit its mask ({share}); check the name, the mask and the camera."
     if best.explained < _LEAST_EXPLAINED and best.match < _LEAST_MATCH:
         return f"{name} does not look like what the photo shows there; check the name and the mask."
-    if rivals and rivals[0].score < best.score + LEAST_MARGIN:
-        return f"{name} looks nearly the same in another orientation; choose between the two pictures."
+    sure = float(probabilities((best, *rivals))[0])
+    if sure < _LEAST_PROBABLE and rivals:
+        return f"{name} is in this orientation with {100 * sure:.0f} % only; choose between the pictures."
+    if sure < _LEAST_PROBABLE:
+        return f"{name} is in this orientation with {100 * sure:.0f} % only, as little of its print is recognised."
     if min(window.cut for window in loss.windows) > _MOST_CUT:
         return f"{name} is cut off by the edge of the photo, so that its distance is uncertain."
     return ""

@@ -26,7 +26,7 @@ from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, FoundS
 from osfcore.photo.lamp import LampFit, NearLampFit, photo_lamp, photo_light
 from osfcore.photo.lens import Lens
 from osfcore.photo.photograph import Box, Photograph, mask_box
-from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, PhotoPose, PhotoStep
+from osfcore.photo.poses import FINE_ACROSS, PhotoModels, PhotoObject, PhotoStep
 from osfcore.photo.read_photograph import RawPhotograph, guessed_intrinsics, intrinsics_from_focal
 from osfcore.photo.segmentation import outline_of
 
@@ -103,12 +103,16 @@ def _camera(number: int, T_table_world: Pose, photo: Photograph) -> CameraJson:
 
 
 def _found(T_table_world: Pose, found: PhotoObject, photo: Photograph) -> FoundObject:
-    def entry(pose: PhotoPose) -> FoundPose:
-        there = T_table_world @ pose.pose
-        position, quaternion = there.position.tolist(), there.quaternion.tolist()
-        return FoundPose(position=position, quaternion=quaternion, loss=pose.loss, iou=pose.iou)
-
-    best, rivals = entry(found.best), [entry(pose) for pose in found.rivals]
+    best, *rivals = (
+        FoundPose(
+            position=(there := T_table_world @ pose.pose).position.tolist(),
+            quaternion=there.quaternion.tolist(),
+            loss=pose.loss,
+            iou=pose.iou,
+            probability=probability,
+        )
+        for pose, probability in zip((found.best, *found.rivals), found.probabilities.tolist(), strict=True)
+    )
     polygons = outline_of(photo.masks[found.name]) if found.name in photo.masks else ()
     outline = [[list(point) for point in polygon] for polygon in polygons]
     return FoundObject(**best.model_dump(), name=found.name, doubt=found.doubt, rivals=rivals, outline=outline)

@@ -68,7 +68,8 @@ function drawChoices() {
 
 function poseButton(object, pose, number) {
   const isTaken = number === (object.choice ?? 0);
-  const likely = number ? `orientation ${number + 1}` : "most likely";
+  const sure = pose.probability === null ? "" : ` (${(100 * pose.probability).toFixed(0)} %)`;
+  const likely = (number ? `orientation ${number + 1}` : "most likely") + sure;
   const button = el(
     "button", { type: "button", attributes: { "aria-pressed": String(isTaken), "aria-label": `${object.label}, ${likely}` } },
     pose.picture ? el("img", { src: pose.picture.slice(1), alt: "Photo, outlines, and the object as it would lie", loading: "lazy" }) : null,
