@@ -27,6 +27,9 @@ from osfcore.geometry.poses import (
     rotation_angle,
 )
 from osfcore.io.image_file import to_uint8
+from osfcore.metrics.pose_errors import rotation_error
+from osfcore.objects.asset import Symmetry
+from osfcore.objects.catalogue import CATALOGUE
 from osfcore.photo.board import Intrinsics, camera_matrix
 from osfcore.photo.photograph import Photograph, check_shared
 from osfcore.photo.placement import Shape, Sight, place_cameras
@@ -791,17 +794,17 @@ def _seen(photo: Photograph, found: Sequence[PhotoObject], number: int = 0) -> P
 #
 # With scores s_k of the poses that were found, the best first, and the print m that is found of the best,
 #
-#     p_k = w_k / (w_none + sum_j w_j),    w_k = exp((s_0 - s_k) / T),    w_none = exp(a - b m),
+#     p_k = w_k / (w_none + sum_j w_j),    w_k = exp((s_0 - s_k) / T),    w_none = exp(a - b m - c (IoU - 0.9)),
 #
-# where "none" stands for an orientation that was not found. T, a and b maximise the likelihood of which poses were
-# right on drawn tables and photographs that nothing else is reported on.
+# where "none" stands for an orientation that was not found, and IoU is that of the best pose's outline and its mask.
+# T, a, b and c maximise the likelihood of which poses were right on drawn tables that nothing is reported on.
 
 
 _PRINT = 0.6  # weight of the print that is found again
-_TEMPERATURE, _UNSEEN, _PRINTED = 0.1, 0.0, 3.0  # T, a, b
-_LEAST_PROBABLE = 0.6  # of a pose that is trusted
+_TEMPERATURE = 0.06  # T
+_UNSEEN, _PRINTED, _FITTING, _USUAL_IOU = -1.7, 4.9, 37.0, 0.9  # a, b, c
+_LEAST_PROBABLE = 0.8  # of a pose that is trusted
 _LEAST_IOU = 0.85
-_LEAST_EXPLAINED, _LEAST_MATCH = 0.1, 0.5  # one of them is enough
 _MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
 
 
@@ -813,7 +816,8 @@ def probabilities(poses: Sequence[PhotoPose]) -> Float[np.ndarray, "K"]:
     """
     scores = np.array([pose.score for pose in poses])
     weights = np.exp(np.minimum(scores[0] - scores, 0) / _TEMPERATURE)
-    return weights / (weights.sum() + np.exp(_UNSEEN - _PRINTED * poses[0].match))
+    unseen = _UNSEEN - _PRINTED * poses[0].match - _FITTING * (poses[0].iou - _USUAL_IOU)
+    return weights / (weights.sum() + np.exp(unseen))
 
 
 def fits_outline(best: PhotoPose) -> bool:
@@ -833,13 +837,11 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
     if not fits_outline(best):
         share = f"they share {100 * best.iou:.0f} %"
         return f"The outline of {name} does not fit its mask ({share}); check the name, the mask and the camera."
-    if best.explained < _LEAST_EXPLAINED and best.match < _LEAST_MATCH:
-        return f"{name} does not look like what the photo shows there; check the name and the mask."
-    sure = float(probabilities((best, *rivals))[0])
-    if sure < _LEAST_PROBABLE and rivals:
-        return f"{name} is in this orientation with {100 * sure:.0f} % only; choose between the pictures."
+    sure, *others = probabilities((best, *rivals)).tolist()
     if sure < _LEAST_PROBABLE:
-        return f"{name} is in this orientation with {100 * sure:.0f} % only, as little of its print is recognised."
+        if others and others[0] > 1 - sure - sum(others):
+            return f"{name} may lie in another orientation (sure to {100 * sure:.0f} %); choose between the pictures."
+        return f"{name} is hard to recognise here (sure to {100 * sure:.0f} %); check its name, box and pictures."
     if min(window.cut for window in loss.windows) > _MOST_CUT:
         return f"{name} is cut off by the edge of the photo, so that its distance is uncertain."
     return ""
@@ -1155,10 +1157,15 @@ def _found_again(
     return replace(taken, **times)
 
 
-def _ranked(poses: Sequence[PhotoPose], least_deg: float) -> list[int]:
-    """Return the numbers of poses by their scores, without those that are turned like better ones."""
-    scores = np.array([pose.score for pose in poses])
-    return distinct(Pose.stacked(pose.pose for pose in poses), scores, len(poses), least_deg)
+def _ranked(poses: Sequence[PhotoPose], name: str) -> list[PhotoPose]:
+    """Return poses by their scores, without those that look like better ones: an object may be symmetric."""
+    symmetry = CATALOGUE[name].symmetry if name in CATALOGUE else Symmetry("none", reason="nothing is known")
+    ranked: list[PhotoPose] = []
+    for one in sorted(poses, key=lambda pose: pose.score):
+        apart = (rotation_error(symmetry, one.pose.quaternion, other.pose.quaternion) for other in ranked)
+        if all(angle > np.deg2rad(_APART_DEG) for angle in apart):
+            ranked.append(one)
+    return ranked
 
 
 def find_object(
@@ -1197,8 +1204,7 @@ def find_object(
         poses, losses = tried, fine(tried)
     poses = poses[distinct(poses, losses, _ALIGNED, _NEAR_DEG)]
     aligned = [_aligned(photos, fine, poses[k], name) for k in range(len(poses.position))]
-    order = _ranked([pose for pose, _ in aligned], _APART_DEG)
-    best, *rivals = (aligned[k][0] for k in order)
+    best, *rivals = _ranked([pose for pose, _ in aligned], name)
     best, seen = _aligned(photos, fine, best.pose, name)
     doubt = doubt_of(name, best, rivals, replace(fine, windows=object_windows(seen, name, _FINE_SIDE)))
     masks = tuple(photo.masks.get(name) for photo in seen)
