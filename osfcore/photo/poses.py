@@ -840,8 +840,8 @@ def doubt_of(name: str, best: PhotoPose, rivals: Sequence[PhotoPose], loss: Pose
     sure, *others = probabilities((best, *rivals)).tolist()
     if sure < _LEAST_PROBABLE:
         if others and others[0] > 1 - sure - sum(others):
-            return f"{name} may lie in another orientation (sure to {100 * sure:.0f} %); choose between the pictures."
-        return f"{name} is hard to recognise here (sure to {100 * sure:.0f} %); check its name, box and pictures."
+            return f"{name} may lie in another orientation (sure to {int(100 * sure)} %); choose between the pictures."
+        return f"{name} is hard to recognise here (sure to {int(100 * sure)} %); check its name, box and pictures."
     if min(window.cut for window in loss.windows) > _MOST_CUT:
         return f"{name} is cut off by the edge of the photo, so that its distance is uncertain."
     return ""

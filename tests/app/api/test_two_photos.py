@@ -1,4 +1,4 @@
-"""Two photos of one table with the printed board: how it is, and how it should be."""
+"""Two photos of one table: how it is and how it should be, with the printed board; and from two sides, without one."""
 
 import cv2
 import numpy as np
@@ -49,20 +49,24 @@ def photograph(world, library, places, camera):
     return jpeg_of(np.clip(seen.images[0], 0, 1)), boxes
 
 
-def looked_at(service, jpeg, boxes, name):
-    """The photo, sent, marked and looked at."""
-    photo = service.post("/api/photos", content=jpeg, headers=ANY, params={"name": name}).json()
-    assert photo["on_board"], photo["notes"]
+def sent(service, jpeg, boxes, name, focal_px=None):
+    """The path of a photo that was sent and marked."""
+    params = {"name": name} if focal_px is None else {"name": name, "focal_px": focal_px}
+    photo = service.post("/api/photos", content=jpeg, headers=ANY, params=params).json()
     for each, box in boxes.items():
         assert mark(service, photo, each, box).status_code == 200
-    path = f"/api/photos/{photo['id']}"
-    service.post(f"{path}/find", json={})
-    found = until(
+    return f"/api/photos/{photo['id']}"
+
+
+def found(service, path, together=()):
+    """What is found in a photo, and in others of the same table."""
+    answer = service.post(f"{path}/find", json={"together": [other.rpartition("/")[2] for other in together]})
+    assert answer.status_code == 202, answer.text
+    photo = until(
         lambda: (now := service.get(path).json())["job"]["state"] not in ("queued", "running") and now, WAIT_S
     )
-    assert found["job"]["state"] == "done", found["job"]["error"]
-    assert found["table"] == "board"
-    return path
+    assert photo["job"]["state"] == "done", photo["job"]["error"]
+    return photo
 
 
 def place(objects, name):
@@ -78,7 +82,10 @@ def test_what_moved_between_two_photos_is_what_has_to_move(service, library):
         photos = [photograph(world, library, places, camera) for places in (now, then)]
     finally:
         world.close()
-    before, after = (looked_at(service, *photo, name) for photo, name in zip(photos, ("now", "then"), strict=True))
+    before, after = (sent(service, *photo, name) for photo, name in zip(photos, ("now", "then"), strict=True))
+    for path in (before, after):
+        assert service.get(path).json()["on_board"]
+        assert found(service, path)["table"] == "board"
     table = service.post(f"{before}/table", json={"despite_doubts": True}).json()["scene"]
     made = service.post(f"{after}/goal", json={"despite_doubts": True}).json()
     assert made["scene"]["id"] == table["id"]
@@ -87,4 +94,27 @@ def test_what_moved_between_two_photos_is_what_has_to_move(service, library):
     assert moves[BOX] < 0.012
     assert moves[CAN] == pytest.approx(np.linalg.norm(MOVED_M), abs=0.015)
     for path in (before, after):
+        service.delete(path)
+
+
+def test_two_photos_without_a_board_are_looked_at_together(service, library):
+    eyes = (np.array([0.1, -0.62, 0.5]), np.array([0.5, -0.3, 0.45]))
+    cameras = [Camera.look_at("phone", eye, np.array([0.0, 0.0, 0.04]), size=640) for eye in eyes]
+    places = {BOX: (-0.07, 0.03), CAN: (0.09, -0.05)}
+    world = Tabletop(library, conditions=Conditions())
+    try:
+        photos = [photograph(world, library, places, camera) for camera in cameras]
+    finally:
+        world.close()
+    focal = float(cameras[0].intrinsics[0, 0])
+    paths = [sent(service, *photo, f"side {k}", focal) for k, photo in enumerate(photos)]
+    assert service.get(paths[0]).json()["marked"] == list(NAMES)
+    photo = found(service, paths[0], paths[1:])
+    assert photo["table"] == "objects"
+    poses = {each["name"]: each["found"]["poses"][0] for each in photo["objects"]}
+    apart = np.linalg.norm(np.subtract(*(poses[name]["position"] for name in NAMES))[:2])
+    assert apart == pytest.approx(np.linalg.norm(np.subtract(places[BOX], places[CAN])), abs=0.015)
+    assert all(each["found"]["outline"] for each in photo["objects"])
+    assert all(pose["probability"] > 0.8 for pose in poses.values())
+    for path in paths:
         service.delete(path)

@@ -33,6 +33,7 @@ from osfcore.photo.poses import (
     poses_around,
     poses_from_box,
     poses_on_table,
+    probabilities,
     seen_through,
     shape_symmetries,
     super_fibonacci,
@@ -84,6 +85,17 @@ def test_of_two_orientations_that_explain_a_photo_alike_the_one_whose_print_is_f
     best, rival = (PhotoPose(taken.pose, loss, 0.95, 1.0, 0.4, m) for loss, m in zip((0.5, 0.51), matches, strict=True))
     loss = PoseLoss(object_windows([taken.photo], NAME, 60), models.surfels(NAME, FINE_ACROSS))
     assert bool(doubt_of(NAME, best, [rival], loss)) == is_doubted
+
+
+def test_probabilities_of_orientations_follow_their_scores_and_the_print(taken):
+    def those(*losses, match=0.8, iou=0.95):
+        return probabilities([PhotoPose(taken.pose, loss, iou, 1.0, 0.4, match) for loss in losses])
+
+    np.testing.assert_allclose(*those(0.5, 0.5))
+    assert those(0.5, 0.5).sum() < 1
+    assert those(0.5, 0.9)[0] > those(0.5, 0.6)[0] > those(0.5, 0.6, 0.6)[0]
+    assert those(0.5)[0] > those(0.5, match=0.2)[0]
+    assert those(0.5, match=0.3)[0] > those(0.5, match=0.3, iou=0.86)[0]
 
 
 @pytest.mark.slow
@@ -168,7 +180,7 @@ def test_an_object_behind_another_of_which_half_is_marked(models, fields, taken)
     assert last.progress.total == 2 + 2 + 1
     for found, pose in zip(last.found, (front, behind), strict=True):
         assert np.rad2deg(rotation_angle(found.best.pose.quaternion, pose.quaternion)) < 5
-        assert found.doubt == ""
+        assert found.probabilities[0] > 0.6
 
 
 # A focal length that nobody knows
