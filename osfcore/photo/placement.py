@@ -308,9 +308,8 @@ class _Bundle:
         def jacobian(x: np.ndarray) -> np.ndarray:  # all differences at once: most of the time is NumPy's overhead
             return (residuals(x + _STEP * np.eye(len(x))) - residuals(x)).T / _STEP
 
-        found = least_squares(
-            residuals, start, jacobian, loss="soft_l1", x_scale="jac", ftol=_TOLERANCE, max_nfev=_EVALUATIONS
-        )  # pyright: ignore[reportArgumentType] - its stubs do not know of derivatives by a function
+        settings = {"loss": "soft_l1", "x_scale": "jac", "ftol": _TOLERANCE, "max_nfev": _EVALUATIONS}
+        found = least_squares(residuals, start, jac=jacobian, **settings)  # pyright: ignore[reportArgumentType]
         after, log_focal = unpacked(found.x)
         return after, float(np.exp(log_focal.sum()))
 

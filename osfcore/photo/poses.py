@@ -797,12 +797,13 @@ def _seen(photo: Photograph, found: Sequence[PhotoObject], number: int = 0) -> P
 #     p_k = w_k / (w_none + sum_j w_j),    w_k = exp((s_0 - s_k) / T),    w_none = exp(a - b m - c (IoU - 0.9)),
 #
 # where "none" stands for an orientation that was not found, and IoU is that of the best pose's outline and its mask.
-# T, a, b and c maximise the likelihood of which poses were right on drawn tables that nothing is reported on.
+# Where too little print is in view to look for (m = 0), a - b m is another constant d. The constants maximise the
+# likelihood of which poses were right on the photographs and drawn tables of development.
 
 
 _PRINT = 0.6  # weight of the print that is found again
-_TEMPERATURE = 0.06  # T
-_UNSEEN, _PRINTED, _FITTING, _USUAL_IOU = -1.7, 4.9, 37.0, 0.9  # a, b, c
+_TEMPERATURE = 0.04  # T
+_UNSEEN, _PRINTED, _PLAIN, _FITTING, _USUAL_IOU = 1.7, 6.9, -1.2, 12.6, 0.9  # a, b, d, c
 _LEAST_PROBABLE = 0.8  # of a pose that is trusted
 _LEAST_IOU = 0.85
 _MOST_CUT = 0.1  # of the mask's border lies on the photo's edge
@@ -816,7 +817,8 @@ def probabilities(poses: Sequence[PhotoPose]) -> Float[np.ndarray, "K"]:
     """
     scores = np.array([pose.score for pose in poses])
     weights = np.exp(np.minimum(scores[0] - scores, 0) / _TEMPERATURE)
-    unseen = _UNSEEN - _PRINTED * poses[0].match - _FITTING * (poses[0].iou - _USUAL_IOU)
+    match = poses[0].match
+    unseen = (_UNSEEN - _PRINTED * match if match else _PLAIN) - _FITTING * (poses[0].iou - _USUAL_IOU)
     return weights / (weights.sum() + np.exp(unseen))
 
 
