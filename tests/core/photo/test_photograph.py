@@ -33,7 +33,6 @@ def disc(radius=14.0):
         ({"well_exposed": np.ones((64, 48), bool)}, "exposure mask"),
         ({"intrinsics": np.diag([1.0, 1, 2])}, "K of"),
         ({"T_world_camera": Pose(np.full(3, np.nan), np.array([1.0, 0, 0, 0]))}, "pose"),
-        ({"on_table": False}, "pose"),
         ({"masks": {"mug": np.ones((24, 32), bool)}}, "mask of mug"),
         ({"masks": {"mug": np.zeros((48, 64), bool)}}, "mask of mug"),
         ({"masks": {"mug": np.ones((48, 64))}}, "mask of mug"),
