@@ -109,7 +109,7 @@ def test_known_cameras_stay(objects):
 
 
 def test_the_focal_length_that_was_assumed_wrongly_is_found(objects):
-    true, assumed = camera_matrix(900, 400, 300), camera_matrix(750, 400, 300)
+    true, assumed = camera_matrix(900.0, 400.0, 300.0), camera_matrix(750.0, 400.0, 300.0)
     sights = [
         {name: sight(seen_through(T.inverse() @ pose, true, assumed)) for name, pose in objects.items()}
         for T in CAMERAS
