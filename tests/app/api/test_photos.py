@@ -198,7 +198,7 @@ def test_a_photo_becomes_a_goal_and_a_table(service):
     assert found["job"]["state"] == "done", found["job"]["error"]
     assert found["table"] == "objects"
     for entry in found["objects"]:
-        assert entry["found"]["poses"][0]["iou"] > 0.9
+        assert entry["found"]["poses"][0]["iou"] > 0.85  # below that an outline is doubted
         sheet = service.get(entry["found"]["poses"][0]["picture"])
         assert Image.open(io.BytesIO(sheet.content)).width > 100
     drawn = service.get(f"{path}/drawing.png")
