@@ -148,6 +148,8 @@ def align_together(
         Poses and cameras.
     """
     poses, cameras = list(poses), list(cameras)
+    if not poses:
+        return poses, cameras
     prepared = [
         [_prepare(w, loss.surfels, pose) for w in loss.windows] for loss, pose in zip(losses, poses, strict=True)
     ]
@@ -1097,12 +1099,11 @@ def _placed(
         )
         for name, its in zip(agreed, views, strict=True)
     ]
-    free = {
-        k for k, T in enumerate(placement.cameras) if T is not None and (k > 0 or on_table) and not photos[k].on_table
-    }
+    where = [k for k, T in enumerate(placement.cameras) if T is not None]
+    free = {k for k in where if not photos[k].on_table} - (set() if on_table else {where[0]})
     start = [Pose.identity() if T is None else T for T in placement.cameras]
     poses, adjusted = align_together(losses, [placement.poses[name] for name in agreed], start, views, free)
-    if not on_table:  # sizes alone show how far away everything is; the world's origin is a camera
+    if agreed and not on_table:  # sizes alone show how far away everything is; the world's origin is a camera
         there = [T.inverse() for T in adjusted]
         losses = [
             replace(

@@ -63,7 +63,7 @@ def summarised(step: PhotoStep, models: PhotoModels, notes: Sequence[str], board
     except InvalidInput as error:
         notes.append(f"The light could not be determined: {error}")
     first, *others = [_camera(number, T_table_world, photo) for number, photo in used]
-    objects = [_found(T_table_world, each, used[0][1]) for each in step.found]
+    objects = [_found(T_table_world, each, step.photos[0]) for each in step.found]
     return FoundScene(table=table, objects=objects, light=light, camera=first, other_cameras=others, notes=notes)
 
 
