@@ -26,6 +26,7 @@ from osfcore.photo.poses import (
     PhotoModels,
     PhotoObject,
     PhotoPose,
+    align_together,
     distinct,
     doubt_of,
     estimate_photo,
@@ -85,6 +86,11 @@ def test_of_two_orientations_that_explain_a_photo_alike_the_one_whose_print_is_f
     best, rival = (PhotoPose(taken.pose, loss, 0.95, 1.0, 0.4, m) for loss, m in zip((0.5, 0.51), matches, strict=True))
     loss = PoseLoss(object_windows([taken.photo], NAME, 60), models.surfels(NAME, FINE_ACROSS))
     assert bool(doubt_of(NAME, best, [rival], loss)) == is_doubted
+
+
+def test_without_an_object_that_is_shared_cameras_stay():
+    cameras = [Pose.identity(), Pose(np.ones(3), np.array([1.0, 0, 0, 0]))]
+    assert align_together([], [], cameras, [], {1}) == ([], cameras)
 
 
 def test_probabilities_of_orientations_follow_their_scores_and_the_print(taken):
