@@ -236,7 +236,7 @@ def test_what_is_no_mesh_is_refused_at_once(own):
         (lambda: glb((60.0, 84.0, 10.0)), GLB, ("84 m", "millimetres")),
         (lambda: glb((6.0, 8.4, 10.0)), GLB, ("10 m", "centimetres")),
         (lambda: glb((0.001, 0.001, 0.002)), GLB, ("2 mm",)),
-        (lambda: glb()[:400], GLB, ("uploaded mesh", "cannot be read")),
+        (lambda: glb()[:400], GLB, ("uploaded mesh", "damaged")),
         (lambda: zipped({"readme.txt": "no mesh"}), ZIP, ("holds no mesh", "GLB")),
         (lambda: zipped({**obj_files(), "other.obj": ""}), ZIP, ("2 meshes", "other.obj")),
         (lambda: zipped(obj_files("lost.png")), ZIP, ("lost.png",)),

@@ -69,7 +69,7 @@ def test_a_photograph_is_straightened_and_placed_as_calibrated(camera_json, raw)
     blank = replace(raw, encoded=np.full_like(raw.encoded, 128))
     nowhere = locate_calibrated(blank, free, Board())
     assert nowhere.T_world_camera is None
-    assert "board" in nowhere.missing
+    assert "no board" in nowhere.notes[-1]
     assumed, given = locate(blank, None, Board()), locate(blank, 4 * K[0, 0], Board())
     assert (assumed.source, given.source) == ("assumed", "given")
     assert given.intrinsics[0, 0] == K[0, 0]
