@@ -4,7 +4,7 @@ FROM debian:bookworm-slim
 # Where torch comes from: the CPU-only builds. Set it to nothing for the default index, whose builds carry CUDA.
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 
-# Debian's python3 is 3.11, for which PyBullet has wheels; expat and glib-free: opencv is the headless build.
+# Debian's python3 is 3.11, for which PyBullet has wheels (x86-64); expat and glib-free: opencv is the headless build.
 RUN apt-get update \
  && apt-get install -y --no-install-recommends ca-certificates python3 python3-venv \
  && rm -rf /var/lib/apt/lists/*

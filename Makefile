@@ -1,7 +1,7 @@
 # make demo   build everything and open the page      make test   the quick tests (minutes)
 # make test-all   every test, browser included      make coverage   lines that the quick tests reach
 # make docs   the site of documents, in build/docs
-# make test-pythons   that the library installs and runs on later Pythons, where there is no simulator
+# make test-pythons   that the library installs and runs on later Pythons, where there is no PyBullet
 # Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   OSF_DATA_DIR=<where objects and runs live>
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)

@@ -14,7 +14,7 @@ A map of the rooms, each importing only from those above it:
     planning     MPPI, costs, push primitives, path planning
     control      Algorithm 1 of the paper as a generator of events over a `World`
     paper        the paper's dynamics model as published, to compare ours with
-    world        the simulated tabletop (PyBullet) and data collection
+    world        the simulated tabletop (PyBullet or MuJoCo) and data collection
     contrib      beyond the paper: files of others, robots, a Gymnasium environment, a client of the service
     inspection   checks of files, and pictures of how they were understood
     experiments  evaluations and benchmarks; only the command line imports it

@@ -8,9 +8,9 @@ from importlib.util import find_spec
 from osfcore.errors import OsfError
 
 PACKAGES = {
-    "sim": ("pybullet", "embreex", "coacd", "imageio_ffmpeg"),
+    "sim": ("mujoco", "embreex", "coacd", "imageio_ffmpeg"),
     "serve": ("fastapi", "fastapi_offline", "uvicorn", "viser", "websockets", "msgspec", "prometheus_client",
-              "itsdangerous", "pydantic_settings", "pybullet"),
+              "itsdangerous", "pydantic_settings", "mujoco"),
     "gym": ("gymnasium",),
     "mcap": ("foxglove",),
     "lerobot": ("pyarrow", "imageio_ffmpeg"),
@@ -21,6 +21,7 @@ PACKAGES = {
 }  # fmt: skip
 # gym-pusht itself comes on top: it would bring an OpenCV that overwrites the headless build.
 _SECOND_STEPS = {"pusht": "pip install --no-deps gym-pusht==0.1.8"}
+_WHERE_THERE_IS_ONE = {"pybullet": "sim"}  # packages that an extra brings only where they can be installed
 _LATEST_FOR_PYBULLET = (3, 11)
 
 
@@ -69,6 +70,8 @@ def as_missing_extra(error: ModuleNotFoundError, what: str) -> MissingExtra | No
     for extra, packages in PACKAGES.items():
         if package in packages:
             return MissingExtra(what, extra, missing(extra))
+    if package in _WHERE_THERE_IS_ONE:
+        return MissingExtra(what, _WHERE_THERE_IS_ONE[package], [package])
     return None
 
 

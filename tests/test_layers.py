@@ -49,7 +49,8 @@ ROOMS = (
     "app.cli",
 )
 OWNERS = {  # who alone may import a package
-    "pybullet": ("osfcore.world.physics",),
+    "pybullet": ("osfcore.world.bullet_physics",),
+    "mujoco": ("osfcore.world.mujoco_physics",),
     "embreex": ("osfcore.world.imaging",),
     "httpx2": ("osfcore.contrib.client", "osfcore.contrib.robots.http_robot"),
     "cma": ("osfcore.estimation.search",),

@@ -84,6 +84,8 @@ class CollectPushesCommand(DataCommand):
     """Frames under one light per episode from the whole hemisphere."""
     renderer: Literal["embree", "tiny"] = "embree"
     """What takes the frames: exact ray tracing, or PyBullet's TinyRenderer."""
+    simulator: Literal["pybullet", "mujoco"] | None = None
+    """What moves the objects; PyBullet where it is installed, else MuJoCo."""
     names: tuple[str, ...] | None = None
     """Objects to choose from; by default all that were fetched."""
     disturb: int = 0

@@ -45,6 +45,8 @@ class RunEpisode(DataCommand):
     (image), or as another package does it."""
     world: str = "simulated"
     """What is pushed: our simulation, or another package's."""
+    simulator: Literal["pybullet", "mujoco"] | None = None
+    """What moves the objects of our simulation; PyBullet where it is installed, else MuJoCo. The report says which."""
     planner: str = "mppi"
     """What plans: MPPI, or another package's."""
     estimator: str = "ours"
@@ -67,6 +69,7 @@ class RunEpisode(DataCommand):
         from osfcore.control.events import CostKind, EpisodeSettings
         from osfcore.fields.devices import pick_device
         from osfcore.planning.mppi import PlanSettings
+        from osfcore.world.simulators import default_simulator
 
         plan = PlanSettings(self.samples, self.horizon, self.temperature)
         cost: CostKind = "image" if self.cost == "image" else "pose"
@@ -75,7 +78,9 @@ class RunEpisode(DataCommand):
         order = EpisodeOrder(
             self.out, self.data_dir, self.names, self.objects, check_seed(self.seed), self.goal, self.found, self.moved,
             settings=settings, device=str(pick_device(self.device)),
-            parts=PartNames(self.world, self.estimator, self.planner, self.cost),
+            parts=PartNames(
+                self.world, self.estimator, self.planner, self.cost, self.simulator or default_simulator()
+            ),
         )  # fmt: skip
         report = report_of(run_episode(order))
         self.say(*_summary(report), f"Report, frames, video and recording: {self.out}")

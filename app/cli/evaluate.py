@@ -223,11 +223,15 @@ class EvaluateDynamicsCommand(ParallelEvaluation):
 
     method: Literal["ours", "paper"] = "ours"
     """Whose predictions: our model's; the paper's as published, with results in the folder paper within --out."""
+    simulator: Literal["pybullet", "mujoco"] | None = None
+    """What moves the objects; PyBullet where it is installed, else MuJoCo."""
 
     def _steps(self, executor: Executor | None) -> Iterator[Any]:
         from osfcore.experiments.dynamics import EvaluateDynamics, evaluate_dynamics
+        from osfcore.world.simulators import default_simulator
 
-        config = EvaluateDynamics(self.folder, self.tasks, self.seed, self.names, self.data_dir, self.method)
+        simulator = self.simulator or default_simulator()
+        config = EvaluateDynamics(self.folder, self.tasks, self.seed, self.names, self.data_dir, self.method, simulator)
         return evaluate_dynamics(config, self.trained, self.assets, executor)
 
     def _show(self, report: dict[str, Any]) -> None:
@@ -285,6 +289,8 @@ class EvaluateMpcCommand(ParallelEvaluation):
     """Sequences of actions in each round of its plans."""
     oracle_tries: int = 8
     """Episodes that it has at most for each task, of which the best counts; the last with the simulator's pushes."""
+    simulator: Literal["pybullet", "mujoco"] | None = None
+    """What moves the objects; PyBullet where it is installed, else MuJoCo."""
 
     def _steps(self, executor: Executor | None) -> Iterator[Any]:
         from osfcore.control.events import EpisodeSettings
@@ -293,6 +299,7 @@ class EvaluateMpcCommand(ParallelEvaluation):
         from osfcore.experiments.rivals.visual_foresight import ForesightSettings
         from osfcore.paper.mppi import GaussianPlanSettings
         from osfcore.planning.mppi import PlanSettings
+        from osfcore.world.simulators import default_simulator
 
         variant = Variant(self.method, frozenset(self.ours), frozenset(self.truths), self.views, self.masks)
         asked = {"samples": self.samples, "horizon": self.horizon}
@@ -301,7 +308,7 @@ class EvaluateMpcCommand(ParallelEvaluation):
             self.folder, self.data_dir, self.tasks, self.objects, self.seed, self.family, self.actions, variant,
             self.factor, self.cost, self.names, self.oracle, self.oracle_tries,
             EpisodeSettings(plan=PlanSettings(**plan)), replace(ORACLE_PLAN, samples=self.oracle_samples),
-            GaussianPlanSettings(**plan), ForesightSettings(**plan),
+            GaussianPlanSettings(**plan), ForesightSettings(**plan), self.simulator or default_simulator(),
         )  # fmt: skip
         return evaluate_mpc(config, self.trained, self.assets, executor)
 

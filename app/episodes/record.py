@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -64,12 +64,14 @@ class PartNames:
         estimator: what looks.
         planner: what plans.
         cost: what compares futures; None for what the settings say.
+        simulator: what moves the objects of our own world; None for PyBullet where it is installed, else MuJoCo.
     """
 
     world: str = "simulated"
     estimator: str = "ours"
     planner: str = "mppi"
     cost: str | None = None
+    simulator: Literal["pybullet", "mujoco"] | None = None
 
     def to_json(self) -> dict[str, str]:
         """Those that are named."""

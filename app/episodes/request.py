@@ -36,6 +36,7 @@ from osfcore.planning.parts import COST, COSTS, PLANNER, PLANNERS
 from osfcore.plugins import part_factory
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.scenes import SceneRequest
+from osfcore.world.simulators import default_simulator
 from osfcore.world.tabletop import WORLD, WORLDS, Tabletop, WorldInputs
 from osfcore.world.tasks import arranged_goal, random_goal
 
@@ -130,7 +131,8 @@ def given(order: EpisodeOrder) -> Given:
         fields.info(name)
     among = tuple(name for name in fields.names() if assets.has(name))
     make = part_factory(WORLD, order.parts.world, WORLDS)
-    world = make(WorldInputs(assets, SceneRequest(names, order.objects, order.light, among)))
+    simulator = order.parts.simulator or default_simulator()
+    world = make(WorldInputs(assets, SceneRequest(names, order.objects, order.light, among), simulator))
     try:
         if not isinstance(world, Tabletop):
             return _given_by_image(order, world)

@@ -32,7 +32,8 @@ from osfcore.io.image_file import to_uint8
 from osfcore.metrics.success import RearrangementScore, RearrangementTask, score_of
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.data_dir import default_data_dir
-from osfcore.world.scenes import SceneRequest, check_request
+from osfcore.world.scenes import Conditions, SceneRequest, check_request
+from osfcore.world.simulators import Simulator, default_simulator
 from osfcore.world.tabletop import Tabletop
 from osfcore.world.tasks import Family, TaskSet, check_tasks, draw_task
 
@@ -84,6 +85,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         obs: contents of observations: "poses", "pixels" or "both".
         image_side: side of observed images [px].
         render_mode: "rgb_array" or None.
+        simulator: "pybullet" or "mujoco"; PyBullet where it is installed if None.
 
     Attributes:
         objects_to_choose_from: names of the objects by their numbers in observations.
@@ -106,6 +108,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         obs: Kind = "poses",
         image_side: int = 128,
         render_mode: str | None = None,
+        simulator: Simulator | None = None,
     ) -> None:
         if obs not in KINDS:
             raise InvalidInput("kind of observations", repr(obs), f"one of {', '.join(KINDS)}")
@@ -114,7 +117,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._library = AssetLibrary((default_data_dir() if data_dir is None else Path(data_dir)) / "objects")
         check_request(self._library, SceneRequest(count=objects, among=names))
         self.objects_to_choose_from = self._library.names() if names is None else tuple(names)
-        self._tasks = TaskSet(self.objects_to_choose_from, family, objects)
+        simulator = simulator or default_simulator()
+        self._tasks = TaskSet(self.objects_to_choose_from, family, objects, simulator=simulator)
         check_tasks(self._tasks)
         self._kind: Kind = obs
         self.render_mode = render_mode
@@ -123,7 +127,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._symmetries = {name: self._library.info(name).symmetry for name in self.objects_to_choose_from}
         self.action_space = gymnasium.spaces.Box(-_SPEED, _SPEED, (2,), np.float32)
         self.observation_space = self._space(image_side)
-        self._world = Tabletop(self._library, cameras=self._cameras)
+        conditions = Conditions(simulator=simulator)
+        self._world = Tabletop(self._library, cameras=self._cameras, conditions=conditions)
         self._task: RearrangementTask | None = None
         self._goal_image: UInt8[np.ndarray, "h w 3"] | None = None
 

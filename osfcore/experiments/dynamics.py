@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from dataclasses import fields as fields_of
 from itertools import islice
 from pathlib import Path
@@ -49,6 +49,7 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper import dynamics as paper
 from osfcore.random_streams import Stream, stream_seed
 from osfcore.world.collect_pushes import CollectPushes, collect_pushes
+from osfcore.world.simulators import Simulator, default_simulator
 
 # What is rolled out, by whom, and how far it ends from the truth.
 
@@ -589,6 +590,7 @@ class EvaluateDynamics:
         names: objects; all that have a field and a mesh if None.
         data_dir: where a network trained on this machine may be.
         method: whose predictions.
+        simulator: what moves the objects.
     """
 
     folder: Path
@@ -597,6 +599,7 @@ class EvaluateDynamics:
     names: tuple[str, ...] | None = None
     data_dir: Path | None = None
     method: DynamicsMethod = "ours"
+    simulator: Simulator = field(default_factory=default_simulator)
 
     @property
     def results(self) -> Path:
@@ -644,7 +647,10 @@ def evaluate_dynamics(
     for done, entry in enumerate(sets):
         if not (path := _path(config, entry)).exists():
             seed = stream_seed(config.seed, Stream.HELD_OUT_PUSHES, entry.objects, int(entry.policy == "paper"))
-            pushes = CollectPushes(path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names)
+            pushes = CollectPushes(
+                path, entry.episodes, _STEPS, entry.objects, entry.policy, seed, names=entry.names,
+                simulator=config.simulator,
+            )  # fmt: skip
             for step in collect_pushes(pushes, assets, executor):
                 yield EvaluationStep(done, total, f"Pushes, {entry.objects} objects: {step.note}")
     shapes = load_shapes(config.data_dir, fields, names)
@@ -689,6 +695,7 @@ def _sets(config: EvaluateDynamics, names: tuple[str, ...], unseen: tuple[str, .
 
 
 def _path(config: EvaluateDynamics, entry: _Set) -> Path:
-    """Return where the episodes of a set are kept; the name holds all that they depend on, but for the simulator."""
+    """Return where the episodes of a set are kept; the name holds all that they depend on."""
     which = hashlib.sha256(" ".join(entry.names).encode()).hexdigest()[:8]
-    return config.folder / f"pushes-{entry.key.replace(' ', '-')}-{entry.episodes}-{config.seed}-{which}.h5"
+    engine = "" if config.simulator == "pybullet" else f"-{config.simulator}"
+    return config.folder / f"pushes-{entry.key.replace(' ', '-')}-{entry.episodes}-{config.seed}-{which}{engine}.h5"

@@ -86,6 +86,7 @@ from osfcore.paper.dynamics import weights_path
 from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.planning.mppi import PlanSettings
 from osfcore.random_streams import Stream, stream_rng
+from osfcore.world.simulators import Simulator, default_simulator
 from osfcore.world.tasks import DrawnTask, Family, TaskSet, check_tasks, draw_task
 
 # How well the pushes are predicted that the planner itself makes, from estimated poses.
@@ -198,7 +199,7 @@ class MeasuredEpisodes:
         for count in range(1, tries + 1):
             rng, is_last = stream_rng(self.tasks.seed, Stream.ORACLE, number, count), count == tries
             given = drawn.task, self.assets, models, slow if is_last else settings, rng
-            end = run_told_the_truth(*given, knows_pushes=is_last)
+            end = run_told_the_truth(*given, knows_pushes=is_last, simulator=self.tasks.simulator)
             ends.append((self._score(drawn.task, end.state), end))
             if ends[-1][0].is_tight():
                 break
@@ -502,6 +503,7 @@ class EvaluateMpc:
         oracle_plan: how the oracle plans.
         published: how planning as published samples.
         foresight: how visual foresight plans.
+        simulator: what moves the objects.
     """
 
     folder: Path
@@ -521,6 +523,7 @@ class EvaluateMpc:
     oracle_plan: PlanSettings = ORACLE_PLAN
     published: GaussianPlanSettings = field(default_factory=GaussianPlanSettings)
     foresight: ForesightSettings = field(default_factory=ForesightSettings)
+    simulator: Simulator = field(default_factory=default_simulator)
 
     @property
     def plan(self) -> Plan:
@@ -532,12 +535,13 @@ class EvaluateMpc:
     @property
     def world(self) -> Factor:
         """How the world differs from the usual one."""
-        return factor_named(self.factor) if self.factor else Factor()
+        factor = factor_named(self.factor) if self.factor else Factor()
+        return replace(factor, conditions=replace(factor.conditions, simulator=self.simulator))
 
     @property
     def task_set(self) -> TaskSet:
         """The tasks, as they are drawn."""
-        return TaskSet(self.names or (), self.family, self.objects, self.seed)
+        return TaskSet(self.names or (), self.family, self.objects, self.seed, self.simulator)
 
 
 def evaluate_mpc(
@@ -576,7 +580,7 @@ def episodes_report(config: EvaluateMpc, results: Sequence[TaskResult]) -> MpcRe
 
 def figures_of(config: EvaluateMpc, report: MpcReport) -> dict[str, Any]:
     """Return the figures of a report with what was measured, as plain JSON."""
-    about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor")}
+    about = {key: getattr(config, key) for key in ("family", "objects", "actions", "seed", "factor", "simulator")}
     variant = config.variant
     about["cost"] = "image" if variant.method == "foresight" or variant.published("planning") else config.cost
     about |= {"names": list(config.names or ()), "samples": config.plan.samples, "horizon": config.plan.horizon}
@@ -635,7 +639,8 @@ def episode_pieces(config: EvaluateMpc, fields: FieldLibrary, assets: AssetLibra
         work = partial(episodes.oracle, settings=settings, tries=tries)
         name = _joined("oracle", _plan_name(config.oracle_plan, ORACLE_PLAN))
         kinds[name] = work, {"settings": asdict(settings), "tries": tries}
-    folder = config.folder / "mpc" / f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
+    place = f"{config.family}-{config.objects}-{config.seed}-{config.actions}"
+    folder = config.folder / "mpc" / (place if config.simulator == "pybullet" else f"{place}-{config.simulator}")
     return [
         Piece(f"{n:04d}", TaskCache(folder / kind), {**common, **circumstances}, partial(work, n))
         for kind, (work, circumstances) in kinds.items()

@@ -34,7 +34,9 @@ from osfcore.planning.costs import PoseCost, PoseGoal
 from osfcore.planning.mppi import MPPIPlanner, Rollout
 from osfcore.planning.pushes import PushProposals
 from osfcore.progress import Progress
+from osfcore.world.scenes import Conditions
 from osfcore.world.simulated_dynamics import SimulatedPushes
+from osfcore.world.simulators import Simulator
 from osfcore.world.tabletop import Tabletop
 
 # Whose episodes are measured.
@@ -143,12 +145,13 @@ class SimulatedModel(SimulatedPushes):
     Args:
         assets: meshes.
         names: of the scene's objects.
+        simulator: which.
     """
 
     device = torch.device("cpu")
 
-    def __init__(self, assets: AssetLibrary, names: tuple[str, ...]) -> None:
-        super().__init__({name: assets.load(name) for name in names})
+    def __init__(self, assets: AssetLibrary, names: tuple[str, ...], simulator: Simulator) -> None:
+        super().__init__({name: assets.load(name) for name in names}, simulator)
         self.names = names
 
 
@@ -273,13 +276,15 @@ def run_from_images(
     variant = variant or Variant()
     cameras = default_cameras()[: variant.views]
     with contextlib.ExitStack() as stack:
-        varied = VariedWorld(assets, factor or Factor(), rng.spawn(1)[0], cameras=cameras)
+        factor = factor or Factor()
+        varied = VariedWorld(assets, factor, rng.spawn(1)[0], cameras=cameras)
         world = stack.enter_context(contextlib.closing(varied))
         goal = world.goal_image(task.goal, goal_camera())
         world.restore(task.start)
         models, estimators = parts.models, parts.estimators
         if "dynamics" in variant.truths:
-            simulated = stack.enter_context(contextlib.closing(SimulatedModel(assets, tuple(models.shapes))))
+            simulated = SimulatedModel(assets, tuple(models.shapes), factor.conditions.simulator)
+            stack.enter_context(contextlib.closing(simulated))
             models = replace(models, dynamics=simulated)
         if "poses" in variant.truths:
             estimators = TrueEstimators(estimators.first, estimators.later, estimators.goal, truth=world.truth)
@@ -304,6 +309,7 @@ def run_told_the_truth(
     rng: np.random.Generator,
     *,
     knows_pushes: bool,
+    simulator: Simulator,
 ) -> Ended:
     """Run the same planner with true poses until the goal is reached or all steps are done.
 
@@ -314,12 +320,13 @@ def run_told_the_truth(
         settings: of which only steps, plans and what counts as arrived play a part.
         rng: of the plans.
         knows_pushes: whether the simulator is its dynamics, and not the learned model.
+        simulator: what moves the objects.
     """
     with contextlib.ExitStack() as stack:
-        world = stack.enter_context(contextlib.closing(Tabletop(assets)))
+        world = stack.enter_context(contextlib.closing(Tabletop(assets, conditions=Conditions(simulator=simulator))))
         rollout: Rollout = models.pushes.rollout
         if knows_pushes:
-            simulated = SimulatedModel(assets, task.start.names)
+            simulated = SimulatedModel(assets, task.start.names, simulator)
             rollout = stack.enter_context(contextlib.closing(simulated)).rollout
         world.restore(task.goal)
         camera = goal_camera()

@@ -1,4 +1,4 @@
-"""The simulated tabletop, its pictures, and the data collected from it; the only room that knows PyBullet."""
+"""The simulated tabletop, its pictures, and the data collected from it; only here are PyBullet and MuJoCo known."""
 
 from osfcore.extras import need
 

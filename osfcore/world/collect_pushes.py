@@ -37,6 +37,7 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng, stream_seed
 from osfcore.world.physics import TIME_STEP_S, BodyModel, Physics
 from osfcore.world.scenes import Conditions, Renderer, SceneRequest, check_request
+from osfcore.world.simulators import Simulator, default_simulator, simulate
 from osfcore.world.tabletop import Tabletop
 
 # Substeps from disturbed states.
@@ -55,7 +56,13 @@ _OFF_M, _OFF_RAD = 5e-4, 0.01  # largest sigma of a disturbed pose
 _OFF_SHARE = 0.6  # of the objects, whose pose is disturbed as well
 
 
-def disturbed(episode: PushEpisode, models: Mapping[str, BodyModel], rng: np.random.Generator, count: int) -> Disturbed:
+def disturbed(
+    episode: PushEpisode,
+    models: Mapping[str, BodyModel],
+    rng: np.random.Generator,
+    count: int,
+    simulator: Simulator | None = None,
+) -> Disturbed:
     """Simulate substeps from disturbed states of an episode, `count` for each substep in which something moves.
 
     Args:
@@ -63,12 +70,13 @@ def disturbed(episode: PushEpisode, models: Mapping[str, BodyModel], rng: np.ran
         models: models of its objects.
         rng: draws the disturbances.
         count: number of disturbances of each such state.
+        simulator: what simulates; PyBullet where it is installed if None.
 
     Raises:
         InvalidInput: if the episode was recorded without poses within its actions.
     """
     track = _Track(episode, models)
-    physics = Physics({name: models[name] for name in episode.names})
+    physics = simulate({name: models[name] for name in episode.names}, simulator or default_simulator())
     try:
         parts = [track.disturb(physics, int(step), rng) for step in np.repeat(track.busy, count)]
     finally:
@@ -276,6 +284,7 @@ class CollectPushes:
         size: side of the frames [px].
         random_lights: frames under one light per episode from the whole hemisphere down to the lowest light that is
             allowed, instead of the scene's own; nothing else changes.
+        simulator: what moves the objects; PyBullet where it is installed if None.
     """
 
     out: Path
@@ -291,6 +300,7 @@ class CollectPushes:
     camera: FrameCamera = "0"
     size: int = DEFAULT_IMAGE_SIDE
     random_lights: bool = False
+    simulator: Simulator | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -425,19 +435,26 @@ def _simulate(
 
 @functools.lru_cache(maxsize=2)
 def _tabletop(
-    root: Path, objects: int, names: tuple[str, ...] | None, renderer: Renderer, name: FrameCamera, size: int
+    root: Path,
+    objects: int,
+    names: tuple[str, ...] | None,
+    renderer: Renderer,
+    simulator: Simulator,
+    name: FrameCamera,
+    size: int,
 ) -> Tabletop:
     """Make one simulator per process and setting: its meshes stay loaded from episode to episode."""
     request = SceneRequest(count=objects, among=names)
     camera = goal_camera(size) if name == "goal" else default_cameras(size)[0]
-    conditions = Conditions(renderer=renderer)
+    conditions = Conditions(renderer=renderer, simulator=simulator)
     return Tabletop(AssetLibrary(root), cameras=(camera,), request=request, conditions=conditions)
 
 
 def _run_episode(config: CollectPushes, root: Path, index: int) -> PushEpisode:
     """Simulate one episode, which depends on nothing but the settings and its index."""
     seed = stream_seed(config.seed, Stream.COLLECTED_SCENE, index)
-    world = _tabletop(root, config.objects, config.names, config.renderer, config.camera, config.size)
+    simulator = config.simulator or default_simulator()
+    world = _tabletop(root, config.objects, config.names, config.renderer, simulator, config.camera, config.size)
     world.arrange(seed)
     if config.random_lights:
         lights = stream_rng(config.seed, Stream.COLLECTED_LIGHT, index)
@@ -468,5 +485,6 @@ def _run_episode(config: CollectPushes, root: Path, index: int) -> PushEpisode:
     )
     if config.disturb:
         disturbance = stream_rng(config.seed, Stream.COLLECTED_DISTURBANCE, index)
-        episode = replace(episode, disturbed=disturbed(episode, world.models, disturbance, config.disturb))
+        spread = disturbed(episode, world.models, disturbance, config.disturb, simulator)
+        episode = replace(episode, disturbed=spread)
     return episode

@@ -18,6 +18,7 @@ from osfcore.objects.asset import ObjectAsset
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.imaging import Lamp, TableSurface
 from osfcore.world.physics import Physics, lowest_point
+from osfcore.world.simulators import Simulator, default_simulator
 
 MAX_HEIGHT_M = 1.0  # of an object's centre when it is put somewhere by hand
 
@@ -257,11 +258,12 @@ class Conditions:
         lamp: how strongly, and in which colour, the scene is lit.
         table: what the table looks like.
         friction_factor: on the friction of every object, hence between object and table, and object and pusher; between
-            two objects it counts twice.
+            two objects it counts twice in PyBullet, and once in MuJoCo.
         mass_factor: on the mass and the moments of inertia of every object.
         spot: a near lamp in the place of the distant light; None for the distant light.
         renderer: "embree" (exact shadows, anti-aliased) or "tiny" (PyBullet's TinyRenderer, as the paper used), which
             has no other lamp and no other table.
+        simulator: what moves the objects, "pybullet" or "mujoco"; PyBullet where it is installed.
     """
 
     lamp: Lamp = field(default_factory=Lamp)
@@ -270,6 +272,7 @@ class Conditions:
     mass_factor: float = 1.0
     spot: SpotLamp | None = None
     renderer: Renderer = "embree"
+    simulator: Simulator = field(default_factory=default_simulator)
 
     def __post_init__(self) -> None:
         """Check the factors and the renderer.

@@ -13,8 +13,9 @@ from osfcore.geometry.rollouts import Rollouts, check_actions
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S
 from osfcore.objects.asset import ObjectAsset
-from osfcore.world.physics import SUBSTEPS, Physics, body_model, reached
+from osfcore.world.physics import SUBSTEPS, body_model, reached
 from osfcore.world.scenes import is_calm
+from osfcore.world.simulators import Simulator, default_simulator, simulate
 
 _SPARE_M = 0.003  # beyond its way: so far the pusher must meet nothing for an action to be skipped
 
@@ -22,15 +23,17 @@ _SPARE_M = 0.003  # beyond its way: so far the pusher must meet nothing for an a
 class SimulatedPushes:
     """Predicts pushes by simulating them, one sequence after another.
 
-    While everything is at rest and the pusher only walks past, nothing is simulated. The engine remembers contacts when
+    While everything is at rest and the pusher only walks past, nothing is simulated. PyBullet remembers contacts when
     bodies are put back, so that a sequence may end a millimetre or two from where it ends alone.
 
     Args:
         assets: assets of the objects, by name.
+        simulator: what simulates; PyBullet where it is installed if None.
     """
 
-    def __init__(self, assets: Mapping[str, ObjectAsset]) -> None:
-        self._physics = Physics({name: body_model(asset) for name, asset in assets.items()})
+    def __init__(self, assets: Mapping[str, ObjectAsset], simulator: Simulator | None = None) -> None:
+        models = {name: body_model(asset) for name, asset in assets.items()}
+        self._physics = simulate(models, simulator or default_simulator())
 
     def close(self) -> None:
         """Free the simulation."""

@@ -1,4 +1,4 @@
-"""The simulated tabletop: PyBullet moves the objects, ray tracing (or TinyRenderer) takes the pictures.
+"""The simulated tabletop: PyBullet or MuJoCo moves the objects, ray tracing (or TinyRenderer) takes the pictures.
 
 It implements `osfcore.control.world.World`. It also returns the true state, renders any view and moves objects by hand.
 One process can hold several. It is deterministic: the same seed gives exactly the same results.
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -35,7 +36,10 @@ from osfcore.world.scenes import (
     place_randomly,
     refuse_overlaps,
 )
-from osfcore.world.tiny_renderer import TinyScene
+from osfcore.world.simulators import Simulator, check_simulator, default_simulator, simulate
+
+if TYPE_CHECKING:
+    from osfcore.world.tiny_renderer import TinyScene
 
 _SETTLE_LIMIT_S = 3.0
 
@@ -83,6 +87,9 @@ class Tabletop:
         check_request(library, self._request)
         self._executor = executor
         self._conditions = conditions or Conditions()
+        check_simulator(self._conditions.simulator)
+        if self._conditions.renderer == "tiny":
+            check_simulator("pybullet")
         self._assets: dict[str, ObjectAsset] = {}
         self._models: dict[str, BodyModel] = {}
         self._meshes: dict[str, TracedMesh] = {}
@@ -336,6 +343,8 @@ class Tabletop:
             state = replace(state, names=(), poses=Pose(np.zeros((0, 3)), np.zeros((0, 4))))
         if self._conditions.renderer == "tiny":
             if self._tiny is None:
+                from osfcore.world.tiny_renderer import TinyScene  # knows PyBullet, which need not be there
+
                 self._tiny = TinyScene(self.assets)
             return self._tiny.render(state, cameras)
         self._meshes |= {name: TracedMesh(self._asset(name).mesh) for name in self.names if name not in self._meshes}
@@ -356,7 +365,7 @@ class Tabletop:
         self._models |= {name: body_model(self._asset(name)) for name in names if name not in self._models}
         self.close()
         self.names, c = names, self._conditions
-        self._physics = Physics(self.models, friction_factor=c.friction_factor, mass_factor=c.mass_factor)
+        self._physics = simulate(self.models, c.simulator, friction_factor=c.friction_factor, mass_factor=c.mass_factor)
 
     def _place_all(self, state: SceneState) -> None:
         self._load_objects(state.names)
@@ -385,15 +394,19 @@ class WorldInputs:
     Attributes:
         library: library of the objects' meshes.
         request: scene that `reset` arranges.
+        simulator: what moves the objects.
     """
 
     library: AssetLibrary
     request: SceneRequest
+    simulator: Simulator = field(default_factory=default_simulator)
 
 
 WORLDS: Mapping[str, Callable[[WorldInputs], SimulatedWorld]] = {
-    "simulated": lambda given: Tabletop(given.library, request=given.request),
+    "simulated": lambda given: Tabletop(
+        given.library, request=given.request, conditions=Conditions(simulator=given.simulator)
+    ),
     "tinyrenderer": lambda given: Tabletop(
-        given.library, request=given.request, conditions=Conditions(renderer="tiny")
+        given.library, request=given.request, conditions=Conditions(renderer="tiny", simulator=given.simulator)
     ),
 }

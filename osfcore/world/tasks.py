@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -19,6 +19,7 @@ from osfcore.metrics.success import RearrangementTask
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.scenes import GAP_M, Conditions, SceneRequest
+from osfcore.world.simulators import Simulator, default_simulator
 from osfcore.world.tabletop import Tabletop
 
 # Random scenes by number: none depends on the others.
@@ -247,12 +248,14 @@ class TaskSet:
         family: what their goals ask for.
         objects: in each scene.
         seed: seed of all of them.
+        simulator: in which their objects come to rest.
     """
 
     available: tuple[str, ...]
     family: Family = "shifted"
     objects: int = 3
     seed: int = 0
+    simulator: Simulator = field(default_factory=default_simulator)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -303,7 +306,7 @@ def draw_task(library: AssetLibrary, tasks: TaskSet, number: int) -> DrawnTask:
     for layout in range(_TASK_LAYOUTS):
         rng = stream_rng(tasks.seed, Stream.TASK_GOAL, FAMILIES.index(family), number, layout)
         arranged, is_upright = replace(draw, seed=int(rng.integers(1 << 31))), family == "upright"
-        with opened(arranged, library, is_upright=is_upright) as world:
+        with opened(arranged, library, Conditions(simulator=tasks.simulator), is_upright=is_upright) as world:
             start = world.truth()
             names = tuple(start.names[int(n)] for n in rng.permutation(len(start.names)))
             moved = _lay_out(world, family, names, number, rng)

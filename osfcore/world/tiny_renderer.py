@@ -19,8 +19,8 @@ from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.objects.asset import ObjectAsset, TexturedMesh
+from osfcore.world.bullet_physics import BulletClient, pybullet
 from osfcore.world.imaging import BACKGROUND_RADIANCE, TABLE_ALBEDO, Lamp, Picture, pusher_mesh
-from osfcore.world.physics import BulletClient, pybullet
 
 _NEAR_M, _FAR_M = 0.05, 5.0
 _LIGHT_DISTANCE_M = 3.0

@@ -10,9 +10,9 @@ from tests.support.errors import about
 def test_missing_packages_are_named_with_their_extra(monkeypatch):
     for extra in PACKAGES:
         need(extra, "This")
-    absent, found = ("viser", "uvicorn", "pybullet"), importlib.util.find_spec
+    absent, found = ("viser", "uvicorn", "mujoco"), importlib.util.find_spec
     monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None if name in absent else found(name))
-    assert missing("serve") == ["uvicorn", "viser", "pybullet"]
+    assert missing("serve") == ["uvicorn", "viser", "mujoco"]
     with pytest.raises(MissingExtra, check=about("viser")) as error:
         need("serve", "The service")
     assert "pip install 'osf-manipulation[serve]'" in str(error.value)

@@ -76,7 +76,9 @@ def test_the_loop_goes_from_the_start_toward_the_goal(task, library, models, wor
 @pytest.mark.parametrize("knows_pushes", [True, False])
 def test_with_true_poses_it_comes_nearer(task, library, models, world, knows_pushes):
     settings, rng = EpisodeSettings(steps=12, replan_every=2, plan=PlanSettings(samples=16)), np.random.default_rng(0)
-    ended = runs.run_told_the_truth(task, library, models, settings, rng, knows_pushes=knows_pushes)
+    ended = runs.run_told_the_truth(
+        task, library, models, settings, rng, knows_pushes=knows_pushes, simulator="pybullet"
+    )
     before, after = (score_of(task, state, models.symmetries).moved_mm for state in (task.start, ended.state))
     assert before > 70
     assert after < before / 2
@@ -86,7 +88,9 @@ def test_with_true_poses_it_comes_nearer(task, library, models, world, knows_pus
 
 def test_what_is_at_its_goal_is_left_alone(task, library, models):
     done = replace(task, goal=replace(task.start, pusher=None))
-    ended = runs.run_told_the_truth(done, library, models, QUICK, np.random.default_rng(0), knows_pushes=True)
+    ended = runs.run_told_the_truth(
+        done, library, models, QUICK, np.random.default_rng(0), knows_pushes=True, simulator="mujoco"
+    )
     assert score_of(done, ended.state, models.symmetries).moved_mm == pytest.approx(0, abs=0.01)
     np.testing.assert_allclose(ended.image, ended.goal, atol=1e-3)
 

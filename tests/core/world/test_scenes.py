@@ -10,17 +10,26 @@ from osfcore.geometry.light import Light, SpotLamp
 from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.geometry.workspace import PUSHER_CENTRE_Z_M, WORKSPACE_HALF_M
 from osfcore.world.imaging import Lamp, TableSurface
-from osfcore.world.physics import Physics, body_model
+from osfcore.world.physics import body_model
 from osfcore.world.scenes import Conditions, SceneRequest, is_calm, move_apart, place_randomly, refuse_overlaps, settle
+from osfcore.world.simulators import simulate
 from tests.core.world.boxes import box_asset
 from tests.support.errors import about
 
 
-def physics_of(assets):
-    return contextlib.closing(Physics({name: body_model(asset) for name, asset in assets.items()}))
+@pytest.fixture(params=["pybullet", "mujoco"])
+def physics_of(request):
+    """Starts a simulation of objects by each of the two engines."""
+    pytest.importorskip(request.param)
+
+    def start(assets):
+        models = {name: body_model(asset) for name, asset in assets.items()}
+        return contextlib.closing(simulate(models, request.param))
+
+    return start
 
 
-def test_scenes_of_real_objects_lie_apart_inside_the_workspace_at_rest(library):
+def test_scenes_of_real_objects_lie_apart_inside_the_workspace_at_rest(physics_of, library):
     assets = {name: library.load(name) for name in library.names()}
     with physics_of(assets) as physics:
         for seed in range(3):
@@ -33,13 +42,13 @@ def test_scenes_of_real_objects_lie_apart_inside_the_workspace_at_rest(library):
                 assert all(physics.distance(name, other) > 0 for other in list(assets)[i + 1 :])
 
 
-def test_objects_that_cannot_fit_are_refused():
+def test_objects_that_cannot_fit_are_refused(physics_of):
     assets = {name: box_asset(name, (0.7, 0.7, 0.02)) for name in "ab"}
     with physics_of(assets) as physics, pytest.raises(NoRoom):
         place_randomly(physics, assets, np.random.default_rng(0))
 
 
-def test_everything_that_moves_at_pushing_speed_stops_within_a_second(library):
+def test_everything_that_moves_at_pushing_speed_stops_within_a_second(physics_of, library):
     """In every resting pose, pushed at 0.3 m/s and let go; rolling friction stops cans and bottles too."""
     for name in library.names():
         asset = library.load(name)
@@ -65,7 +74,7 @@ SIDE = 0.1
         ((0.3, 0, SIDE / 2 - 0.012), (0.3, 0, SIDE / 2), (0, 0, SIDE / 2)),  # sunk into the table
     ],
 )
-def test_boxes_are_moved_apart_as_little_as_needed(place, expected_a, expected_b):
+def test_boxes_are_moved_apart_as_little_as_needed(physics_of, place, expected_a, expected_b):
     level, names = np.array([1.0, 0, 0, 0]), ("a", "b")
     with physics_of({name: box_asset(name, (SIDE, SIDE, SIDE)) for name in names}) as physics:
         physics.place_pusher(np.array([0.5, 0.5, 0.06]))
