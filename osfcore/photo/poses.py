@@ -1246,7 +1246,7 @@ def _aligned(photos: Photos, fine: PoseLoss, pose: Pose, name: str) -> tuple[Pho
     seen = [_masked(photo, name, fine.surfels, pose) for photo in photos]
     sharp = replace(fine, windows=object_windows(seen, name, _SHARP_SIDE))
     pose = align(sharp, pose)[0]
-    if fine.table is None and len(sharp.windows) == 1:
+    if fine.table is None and len(sharp.windows) == 1 and any(name in photo.boxes for photo in photos):
         camera = sharp.windows[0].T_camera_world.inverse().position
         pose = Pose(camera + _nearness([sharp], [pose]) * (pose.position - camera), pose.quaternion)
     terms = replace(fine, windows=object_windows(seen, name, _FINE_SIDE)).terms(pose[None])
@@ -1259,7 +1259,8 @@ def _aligned(photos: Photos, fine: PoseLoss, pose: Pose, name: str) -> tuple[Pho
 def _nearness(losses: Sequence[PoseLoss], poses: Sequence[Pose]) -> float:
     """Return the factor of all distances from the cameras at which the losses are least.
 
-    A mask that lacks parts of an object makes it look farther away. The loss sees that these look like the object.
+    A mask that was found from a box and lacks parts of an object makes it look farther away. The loss sees that these
+    look like the object.
     """
     factors, total = 1 + np.linspace(-_MOST_NEARER, _MOST_NEARER, _DISTANCES), np.zeros(_DISTANCES)
     for loss, pose in zip(losses, poses, strict=True):
