@@ -70,16 +70,18 @@ class RunEpisode(DataCommand):
         from osfcore.fields.devices import pick_device
         from osfcore.planning.mppi import PlanSettings
         from osfcore.world.simulators import default_simulator
+        from osfcore.world.tabletop import WORLDS
 
         plan = PlanSettings(self.samples, self.horizon, self.temperature)
         cost: CostKind = "image" if self.cost == "image" else "pose"
         settings = EpisodeSettings(self.steps, self.replan_every, cost, plan, despite_doubts=self.despite_doubts)
+        simulator = self.simulator or (default_simulator() if self.world in WORLDS else None)
         check_place(self.out / REPORT_FILE)
         order = EpisodeOrder(
             self.out, self.data_dir, self.names, self.objects, check_seed(self.seed), self.goal, self.found, self.moved,
             settings=settings, device=str(pick_device(self.device)),
             parts=PartNames(
-                self.world, self.estimator, self.planner, self.cost, self.simulator or default_simulator()
+                self.world, self.estimator, self.planner, self.cost, simulator
             ),
         )  # fmt: skip
         report = report_of(run_episode(order))

@@ -20,7 +20,7 @@ GRAVITY_M_S2 = 9.81
 FLOOR_Z_M = -0.75  # where something lies that was pushed off the table
 REACH_M = 0.05  # gaps are measured up to this
 
-Hull: TypeAlias = tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]
+Hull: TypeAlias = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -228,9 +228,9 @@ def test_without_meshes_there_are_predictions_alone(files, tmp_path, capsys):
 
 def test_without_the_simulator_there_are_predictions_alone(files, data_dir, capsys, monkeypatch):
     folder, count = files
-    monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None if name == "pybullet" else name)
+    monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None if name == "mujoco" else name)
     assert call(folder, data_dir, "--images", str(folder / "images")) == 0
-    assert "predictions alone; the simulator lacks pybullet." in capsys.readouterr().out
+    assert "predictions alone; the simulator lacks mujoco." in capsys.readouterr().out
     assert len(list((folder / "images").glob("*.png"))) == count + 1
 
 

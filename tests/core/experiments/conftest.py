@@ -56,7 +56,7 @@ def runs(monkeypatch):
         yield from (Foreseen(number, np.zeros(3), plan, PAPER) for number in range(steps))
         yield Ended(task.start, PAPER, PAPER)
 
-    def told(task, _assets, _models, settings, _rng, *, knows_pushes):
+    def told(task, _assets, _models, settings, _rng, *, knows_pushes, simulator):
         made.append(("oracle", task.number, "simulator" if knows_pushes else "network", settings.plan.samples))
         return Ended(task.start, PAPER, PAPER)
 

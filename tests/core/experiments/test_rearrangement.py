@@ -132,7 +132,7 @@ def test_both_costs_share_an_oracle(library, tmp_path, runs):
 def test_the_best_of_the_oracles_tries_counts(library, tmp_path, runs, monkeypatch):
     made = []
 
-    def nearer_each_time(task, *_given, knows_pushes):
+    def nearer_each_time(task, *_given, knows_pushes, simulator):
         made.append((task.number, knows_pushes))
         reached = task.goal if (task.number, len(made)) == (0, 2) else task.start
         return Ended(reached, np.full((16, 16, 3), 0.5), np.full((16, 16, 3), 0.5))
