@@ -80,9 +80,7 @@ class RunEpisode(DataCommand):
         order = EpisodeOrder(
             self.out, self.data_dir, self.names, self.objects, check_seed(self.seed), self.goal, self.found, self.moved,
             settings=settings, device=str(pick_device(self.device)),
-            parts=PartNames(
-                self.world, self.estimator, self.planner, self.cost, simulator
-            ),
+            parts=PartNames(self.world, self.estimator, self.planner, self.cost, simulator),
         )  # fmt: skip
         report = report_of(run_episode(order))
         self.say(*_summary(report), f"Report, frames, video and recording: {self.out}")
