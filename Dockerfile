@@ -15,6 +15,7 @@ COPY requirements.lock ./
 RUN python3 -m venv /opt/venv \
  && pip install -c requirements.lock ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} torch
 COPY pyproject.toml README.md LICENSE ./
+COPY .ci/editable.py .ci/
 COPY osfcore osfcore
 COPY app app
 COPY static static

@@ -83,9 +83,12 @@ def imported(module: str) -> set[str]:
     for node in ast.walk(TREES[module]):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= {name if name in SOURCES else node.module for name in names}
+        elif isinstance(node, ast.ImportFrom):
+            package = module.split(".") if SOURCES[module].name == "__init__.py" else module.split(".")[:-1]
+            parts = [*package[: len(package) - node.level + 1] * bool(node.level), *(node.module or "").split(".")]
+            source = ".".join(filter(None, parts))
+            names = {f"{source}.{alias.name}" for alias in node.names}
+            found |= {name if name in SOURCES else source for name in names}
     return found
 
 

@@ -62,6 +62,17 @@ def test_weights_of_rivals_stay_in_the_repository(built, python, place):
     assert "DATA_DIR/fitvid.safetensors" in told
 
 
+def test_a_package_called_app_of_somebody_else_does_not_matter(built, python, place):
+    (wheel,) = built.glob("*.whl")
+    assert {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()} <= {
+        "osfcore", "osf_app", "osf_manipulation-0.1.0.dist-info",
+    }  # fmt: skip
+    (place / "theirs" / "app").mkdir(parents=True)
+    (place / "theirs" / "app" / "__init__.py").write_text("raise RuntimeError")
+    told = run(python.with_name("osf"), "assets", "--help", cwd=place, PYTHONPATH=str(place / "theirs"))
+    assert "fetch" in told.stdout
+
+
 @pytest.mark.parametrize(("name", "words"), [("estimate", "light: 0."), ("plan", "after 12 actions")])
 def test_examples_run_without_simulator_and_service(python, place, name, words):
     shutil.copytree(ROOT / "examples", place / "examples", dirs_exist_ok=True)

@@ -15,7 +15,9 @@ from fastapi.routing import APIRoute
 from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
 
-from app.api import (
+from ..services.service_settings import Settings
+from ..storage.paths import static_folder
+from . import (
     episodes,
     estimates,
     events,
@@ -32,13 +34,11 @@ from app.api import (
     scenes,
     status,
 )
-from app.api.bodies import SMALL_BODY_BYTES, CompressionMiddleware, HeadMiddleware
-from app.api.dependencies import Services, only_the_driver
-from app.api.guards.connection_timeouts import BodyTimeoutMiddleware
-from app.api.guards.security import BodyLimitMiddleware, SecurityMiddleware
-from app.api.guards.token_gate import COOKIE, OPEN, TokenMiddleware
-from app.services.service_settings import Settings
-from app.storage.paths import static_folder
+from .bodies import SMALL_BODY_BYTES, CompressionMiddleware, HeadMiddleware
+from .dependencies import Services, only_the_driver
+from .guards.connection_timeouts import BodyTimeoutMiddleware
+from .guards.security import BodyLimitMiddleware, SecurityMiddleware
+from .guards.token_gate import COOKIE, OPEN, TokenMiddleware
 
 _DESCRIPTION = (
     "Scenes of real objects on a lit table, a pusher to move them, cameras to look at them, estimates of what they "

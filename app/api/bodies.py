@@ -21,8 +21,8 @@ from starlette.responses import FileResponse
 from starlette.staticfiles import NotModifiedResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.models import Input
-from app.api.problems import NotFound, too_large
+from .models import Input
+from .problems import NotFound, too_large
 
 JSON = "application/json"
 SMALL_BODY_BYTES = 256 << 10  # of JSON that describes a scene, a goal or an order

@@ -17,29 +17,30 @@ from fastapi import Depends, Request
 from pydantic import BaseModel
 from starlette.requests import HTTPConnection
 
-from app.processes.client import ProcessBusy, ProcessClient
-from app.processes.predict_process import predictor_main
-from app.processes.render_process import renderer_main
-from app.services.disturber import Disturber
-from app.services.driver import GRACE_S, Driver
-from app.services.episodes import Episodes
-from app.services.estimates import Estimates
-from app.services.examples import OPENING, preset
-from app.services.fields import FieldCatalogue
-from app.services.goals import GoalChecks, Goals
-from app.services.look_outlines import Outliner
-from app.services.objects import OwnObjects, Thumbnails
-from app.services.photos import BoardPhotos, PhotoTables, TablePhotos
-from app.services.pushes import Predictions, Pushes
-from app.services.robot import RobotTable
-from app.services.runner import DemoScene, Runner
-from app.services.service_settings import Settings
-from app.storage.database import Store
-from app.storage.photos import PhotoReader
-from app.viewer import Viewer
 from osfcore.errors import OsfError
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import CATALOGUE
+
+from ..processes.client import ProcessBusy, ProcessClient
+from ..processes.predict_process import predictor_main
+from ..processes.render_process import renderer_main
+from ..services.disturber import Disturber
+from ..services.driver import GRACE_S, Driver
+from ..services.episodes import Episodes
+from ..services.estimates import Estimates
+from ..services.examples import OPENING, preset
+from ..services.fields import FieldCatalogue
+from ..services.goals import GoalChecks, Goals
+from ..services.look_outlines import Outliner
+from ..services.objects import OwnObjects, Thumbnails
+from ..services.photos import BoardPhotos, PhotoTables, TablePhotos
+from ..services.pushes import Predictions, Pushes
+from ..services.robot import RobotTable
+from ..services.runner import DemoScene, Runner
+from ..services.service_settings import Settings
+from ..storage.database import Store
+from ..storage.photos import PhotoReader
+from ..viewer import Viewer
 
 Result = TypeVar("Result")
 Source = TypeVar("Source")

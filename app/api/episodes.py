@@ -11,22 +11,23 @@ from fastapi import APIRouter, Depends, Path, Query, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel, Field, ValidationError
 
-from app.api.bodies import FORGOTTEN, PNG, BoundedRoute, Forget, OpenFile, binary
-from app.api.dependencies import Services, ServicesDep, slow, urgent
-from app.api.events import SEEN, LastEventId, StreamDep, followed, unended
-from app.api.jobs import JobOut, ProgressOut, progress_of
-from app.api.models import HORIZON, SAMPLES, STEPS, DisplayName, Horizon, Input, Poses, Samples, SceneRef, Steps
-from app.api.paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
-from app.api.problems import named_in_path, problems
-from app.episodes.file_names import REPORT_FILE
-from app.episodes.frames import Part
-from app.episodes.settings import ChosenSettings
-from app.jobs.job import Job
-from app.jobs.kinds.episodes import EpisodeParams
-from app.jobs.params import Identifier, Seed
 from osfcore.control.events import CostKind, EpisodeSettings, Matter
 from osfcore.errors import CorruptFile
 from osfcore.paper.method import METHODS, Method
+
+from ..episodes.file_names import REPORT_FILE
+from ..episodes.frames import Part
+from ..episodes.settings import ChosenSettings
+from ..jobs.job import Job
+from ..jobs.kinds.episodes import EpisodeParams
+from ..jobs.params import Identifier, Seed
+from .bodies import FORGOTTEN, PNG, BoundedRoute, Forget, OpenFile, binary
+from .dependencies import Services, ServicesDep, slow, urgent
+from .events import SEEN, LastEventId, StreamDep, followed, unended
+from .jobs import JobOut, ProgressOut, progress_of
+from .models import HORIZON, SAMPLES, STEPS, DisplayName, Horizon, Input, Poses, Samples, SceneRef, Steps
+from .paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
+from .problems import named_in_path, problems
 
 _TEMPERATURE = (1e-6, 1e6)
 

@@ -10,7 +10,15 @@ from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Res
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel, Field
 
-from app.api.bodies import (
+from osfcore.errors import OsfError
+from osfcore.io.scene_file import EstimateJson
+from osfcore.paper.method import Method
+
+from ..jobs.job import Job
+from ..jobs.kinds.estimates import EstimateParams, Mode
+from ..jobs.params import Identifier, Seed
+from ..services.estimates import Asked, Estimates
+from .bodies import (
     BINARY,
     FORGOTTEN,
     JSON,
@@ -22,20 +30,13 @@ from app.api.bodies import (
     refuse_form,
     whole_body,
 )
-from app.api.dependencies import ServicesDep, urgent
-from app.api.events import SEEN, LastEventId, StreamDep, followed, unended
-from app.api.jobs import ProgressOut, progress_of
-from app.api.models import FileName, Input
-from app.api.paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
-from app.api.problems import named_in_path, problems
-from app.api.scenes import COMPARED, compared, compared_png
-from app.jobs.job import Job
-from app.jobs.kinds.estimates import EstimateParams, Mode
-from app.jobs.params import Identifier, Seed
-from app.services.estimates import Asked, Estimates
-from osfcore.errors import OsfError
-from osfcore.io.scene_file import EstimateJson
-from osfcore.paper.method import Method
+from .dependencies import ServicesDep, urgent
+from .events import SEEN, LastEventId, StreamDep, followed, unended
+from .jobs import ProgressOut, progress_of
+from .models import FileName, Input
+from .paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
+from .problems import named_in_path, problems
+from .scenes import COMPARED, compared, compared_png
 
 METHOD = '"ours", or "paper": CMA-ES alone with fields as published, which is slower; not for mode "goal".'
 

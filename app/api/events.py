@@ -19,26 +19,27 @@ from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from app.api.dependencies import Services, ServicesDep, TooManyStreams
-from app.api.goals import DraftOut
-from app.api.jobs import JobOut
-from app.api.models import Visitor
-from app.api.page import DriverOut
-from app.api.predictions import PushOut
-from app.api.problems import problems
-from app.api.scenes import scene_out
-from app.jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
-from app.jobs.kinds import KINDS
-from app.processes.messages.scene_messages import FramesTaken, SceneChanged
-from app.services.driver import DriverChanged
-from app.services.event_hub import CurrentScene, Notice
-from app.services.goals import Draft, DraftChanged, GoalsChanged
-from app.services.photos import PhotosChanged
-from app.services.pushes import Push, PushChanged
-from app.storage.paths import without_places
 from osfcore.control.events import Looking
 from osfcore.errors import OsfError, UnknownName
 from osfcore.io.image_file import encode_jpeg
+
+from ..jobs.job import Job, JobChanged, JobForgotten, JobView, job_from_fields
+from ..jobs.kinds import KINDS
+from ..processes.messages.scene_messages import FramesTaken, SceneChanged
+from ..services.driver import DriverChanged
+from ..services.event_hub import CurrentScene, Notice
+from ..services.goals import Draft, DraftChanged, GoalsChanged
+from ..services.photos import PhotosChanged
+from ..services.pushes import Push, PushChanged
+from ..storage.paths import without_places
+from .dependencies import Services, ServicesDep, TooManyStreams
+from .goals import DraftOut
+from .jobs import JobOut
+from .models import Visitor
+from .page import DriverOut
+from .predictions import PushOut
+from .problems import problems
+from .scenes import scene_out
 
 
 class FrameEvent(BaseModel):

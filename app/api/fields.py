@@ -7,17 +7,18 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from app.api.bodies import PNG, OpenFile, refuse_form, upload
-from app.api.dependencies import Services, ServicesDep
-from app.api.models import FileName, Input
-from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
-from app.api.problems import named_in_path, problems
-from app.jobs.kinds.fields import TrainFieldParams
-from app.jobs.params import Identifier
-from app.services.fields import NoTrainedField
-from app.services.image_sets import SetRecord
 from osfcore.fields.field_library import FieldInfo
 from osfcore.paper.method import Method
+
+from ..jobs.kinds.fields import TrainFieldParams
+from ..jobs.params import Identifier
+from ..services.fields import NoTrainedField
+from ..services.image_sets import SetRecord
+from .bodies import PNG, OpenFile, refuse_form, upload
+from .dependencies import Services, ServicesDep
+from .models import FileName, Input
+from .paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
+from .problems import named_in_path, problems
 
 
 class FieldOut(BaseModel):

@@ -9,7 +9,16 @@ from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Res
 from pydantic import BaseModel, Field, model_validator
 from starlette.concurrency import run_in_threadpool
 
-from app.api.bodies import (
+from osfcore.errors import InvalidInput, OsfError
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.poses import Pose
+from osfcore.io.scene_file import CameraJson, ObjectJson, camera_from_json
+
+from ..jobs.params import Identifier, ObjectCount, Seed
+from ..services.goals import Draft, GoalVerdict, NoDraft
+from ..storage.photos import PhotoCrop
+from ..storage.records import GoalRecord, Source
+from .bodies import (
     JPEG,
     JSON,
     PNG,
@@ -23,19 +32,11 @@ from app.api.bodies import (
     upload,
     whole_body,
 )
-from app.api.dependencies import Services, ServicesDep, slow
-from app.api.models import DisplayName, Input, LightIn, Poses, SceneRef
-from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
-from app.api.problems import named_in_path, problems
-from app.api.scenes import SceneObject
-from app.jobs.params import Identifier, ObjectCount, Seed
-from app.services.goals import Draft, GoalVerdict, NoDraft
-from app.storage.photos import PhotoCrop
-from app.storage.records import GoalRecord, Source
-from osfcore.errors import InvalidInput, OsfError
-from osfcore.geometry.cameras import Camera
-from osfcore.geometry.poses import Pose
-from osfcore.io.scene_file import CameraJson, ObjectJson, camera_from_json
+from .dependencies import Services, ServicesDep, slow
+from .models import DisplayName, Input, LightIn, Poses, SceneRef
+from .paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
+from .problems import named_in_path, problems
+from .scenes import SceneObject
 
 GoalName = Annotated[DisplayName, Field(description="For people.")]
 

@@ -7,15 +7,15 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Body, Depends, Path, Response
 from pydantic import BaseModel, Field
 
-from app.api.bodies import FORGOTTEN, PNG, BoundedRoute, Forget, OpenFile, binary
-from app.api.dependencies import ServicesDep, urgent
-from app.api.models import Input
-from app.api.paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
-from app.api.problems import named_in_path, problems
-from app.jobs.job import Job, State, check_file_name
-from app.jobs.kinds import KindName
-from app.jobs.kinds.collections import CollectObjectParams, CollectPushesParams, CollectTableParams, FetchAssetsParams
-from app.jobs.kinds.fields import COMPARISON, PREVIEW, TrainFieldParams
+from ..jobs.job import Job, State, check_file_name
+from ..jobs.kinds import KindName
+from ..jobs.kinds.collections import CollectObjectParams, CollectPushesParams, CollectTableParams, FetchAssetsParams
+from ..jobs.kinds.fields import COMPARISON, PREVIEW, TrainFieldParams
+from .bodies import FORGOTTEN, PNG, BoundedRoute, Forget, OpenFile, binary
+from .dependencies import ServicesDep, urgent
+from .models import Input
+from .paging import DEFAULT_PAGE, AfterJob, JobPageOut, Limit
+from .problems import named_in_path, problems
 
 
 class CollectPushesJob(Input):

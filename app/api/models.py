@@ -11,13 +11,14 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from app.jobs.params import Identifier, ObjectName
 from osfcore.control.events import MAX_STEPS
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import MAX_HORIZON, MAX_SEQUENCES
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.objects.fetch import MAX_TEXT
+
+from ..jobs.params import Identifier, ObjectName
 
 VISITOR = "[A-Za-z0-9_-]+"
 

@@ -8,16 +8,17 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from app.api.bodies import PNG, refuse_form, upload
-from app.api.dependencies import Services, ServicesDep, slow
-from app.api.jobs import JobOut
-from app.api.models import FileName, Label, Vector3
-from app.api.paging import DamagedOut
-from app.api.problems import named_in_path, problems
-from app.jobs.params import ObjectName
 from osfcore.errors import OsfError
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.objects.fetch import MAX_MASS_KG, NewObject
+
+from ..jobs.params import ObjectName
+from .bodies import PNG, refuse_form, upload
+from .dependencies import Services, ServicesDep, slow
+from .jobs import JobOut
+from .models import FileName, Label, Vector3
+from .paging import DamagedOut
+from .problems import named_in_path, problems
 
 
 class SymmetryOut(BaseModel):

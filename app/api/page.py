@@ -7,17 +7,18 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Path, Query
 from pydantic import BaseModel, Field
 
-from app.api.bodies import BoundedRoute
-from app.api.dependencies import Services, ServicesDep, slow
-from app.api.goals import GoalOut
-from app.api.models import Input, Visitor
-from app.api.problems import named_in_path, problems
-from app.api.scenes import SceneOut, scene_out
-from app.jobs.params import Identifier
-from app.services.examples import PRESETS, Stories, preset, set_up
-from app.storage.paths import static_folder
-from app.viewer.page_views import Replay, Shows, Wish
 from osfcore.errors import InvalidInput
+
+from ..jobs.params import Identifier
+from ..services.examples import PRESETS, Stories, preset, set_up
+from ..storage.paths import static_folder
+from ..viewer.page_views import Replay, Shows, Wish
+from .bodies import BoundedRoute
+from .dependencies import Services, ServicesDep, slow
+from .goals import GoalOut
+from .models import Input, Visitor
+from .problems import named_in_path, problems
+from .scenes import SceneOut, scene_out
 
 driver_router = APIRouter(prefix="/api/driver", tags=["driver"], responses=problems(), route_class=BoundedRoute)
 

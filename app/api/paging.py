@@ -8,7 +8,7 @@ from typing import Annotated, Protocol, TypeVar
 from fastapi import Query
 from pydantic import BaseModel, Field
 
-from app.storage.records import Damaged
+from ..storage.records import Damaged
 
 DEFAULT_PAGE = 100
 _AFTER = "The `next` of the page before; the list begins with its first entry if left out."

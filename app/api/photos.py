@@ -12,24 +12,25 @@ from fastapi import APIRouter, Depends, HTTPException, Path, Query, Request, Res
 from pydantic import BaseModel, Field, FiniteFloat
 from starlette.concurrency import run_in_threadpool
 
-from app.api.bodies import JPEG, PNG, BoundedRoute, OpenFile, is_photo, kind_of, refuse_form, upload, whole_body
-from app.api.dependencies import Services, ServicesDep, slow
-from app.api.goals import GoalOut
-from app.api.jobs import JobOut
-from app.api.models import Box, DisplayName, Excerpt, Input, Pixel
-from app.api.paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
-from app.api.problems import named_in_path, problems
-from app.api.scenes import SceneOut, scene_out
-from app.jobs.job import Job
-from app.jobs.kinds.photos import sheet_name
-from app.jobs.params import Identifier, Seed
-from app.processes.messages.photo_messages import CameraSource, Mark, Points, Stroke
-from app.storage.records import MarkedObject, TablePhoto
 from osfcore.geometry.workspace import TABLE_SIDE_M
 from osfcore.photo.board import BOARD_FORM, Board, board_of, board_pdf
 from osfcore.photo.calibration import MOST_PHOTOS, CalibrationJson, board_place, calibration_to_json
 from osfcore.photo.camera_files import known_camera
 from osfcore.photo.found_scene import FoundLight, FoundObject, FoundPose, TableSource
+
+from ..jobs.job import Job
+from ..jobs.kinds.photos import sheet_name
+from ..jobs.params import Identifier, Seed
+from ..processes.messages.photo_messages import CameraSource, Mark, Points, Stroke
+from ..storage.records import MarkedObject, TablePhoto
+from .bodies import JPEG, PNG, BoundedRoute, OpenFile, is_photo, kind_of, refuse_form, upload, whole_body
+from .dependencies import Services, ServicesDep, slow
+from .goals import GoalOut
+from .jobs import JobOut
+from .models import Box, DisplayName, Excerpt, Input, Pixel
+from .paging import DEFAULT_PAGE, AfterEntry, DamagedOut, Limit, PageOut, page
+from .problems import named_in_path, problems
+from .scenes import SceneOut, scene_out
 
 BoardText = Annotated[str, Field(max_length=100)]
 _BOARD = f"Board that may be in view: {BOARD_FORM}; empty for the one to print."

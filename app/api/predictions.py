@@ -11,14 +11,6 @@ import numpy as np
 from fastapi import APIRouter, Response
 from pydantic import BaseModel, FailFast, Field, FiniteFloat
 
-from app.api.bodies import BoundedRoute
-from app.api.dependencies import Services, ServicesDep, slow
-from app.api.models import Excerpt, Input, Position, Quaternion, Vector3, Velocity
-from app.api.problems import problems
-from app.jobs.params import ObjectName
-from app.processes.messages.neural_messages import Predicted
-from app.processes.messages.scene_messages import SceneRecord
-from app.services.pushes import SPEED_M_S, NoPush, Push, PushState
 from osfcore.errors import InvalidInput, UnknownName
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
@@ -27,6 +19,15 @@ from osfcore.geometry.states import MAX_OBJECTS, SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S
 from osfcore.io.scene_file import rollouts_to_json
 from osfcore.paper.method import Method
+
+from ..jobs.params import ObjectName
+from ..processes.messages.neural_messages import Predicted
+from ..processes.messages.scene_messages import SceneRecord
+from ..services.pushes import SPEED_M_S, NoPush, Push, PushState
+from .bodies import BoundedRoute
+from .dependencies import Services, ServicesDep, slow
+from .models import Excerpt, Input, Position, Quaternion, Vector3, Velocity
+from .problems import problems
 
 _OVERHEAD = (0.0, 0.0, 1.0)
 Sequence = Annotated[list[Velocity], Field(min_length=1, max_length=MAX_HORIZON), FailFast()]

@@ -15,32 +15,6 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Route
 
-from app.api.dependencies import TooManyStreams
-from app.episodes.clip import NoClip
-from app.jobs.kinds.objects import MeshRefused
-from app.jobs.process import JobDied, JobStopped
-from app.jobs.registry import QueueFull, WrongJobState
-from app.processes.client import ProcessBusy, ProcessUnavailable
-from app.processes.photo_process import PhotoRefused
-from app.processes.server import InternalError, OutOfMemory
-from app.services.disturber import NoRoomToNudge
-from app.services.driver import NotDriving
-from app.services.episodes import EpisodeGoesOn, GoalUnknown, NoGoal, NoTrajectory
-from app.services.estimates import NoImages, NoPrior, NoScene
-from app.services.fields import MissingFields, NoPublishedField, NoTrainedField, ShippedField
-from app.services.goals import DraftUnsound, GoalRefused, NoDraft, NoPhoto, NoTable
-from app.services.image_sets import TooManySets
-from app.services.objects import CatalogueObject, ObjectNeeded, ObjectTaken
-from app.services.photos import NotFoundYet, NothingMarked, PhotoDoubtful
-from app.services.pushes import CannotExecute, NoPush, NothingToPush
-from app.services.robot import NoPicture, NoRobot, NothingAsked, RobotBusy
-from app.services.runner import SceneNeeded, SetInUse, TrainingAlready, WorkshopInUse
-from app.services.scenes import SceneHeld, TooManyScenes
-from app.storage.database import CannotStore
-from app.storage.paths import without_places
-from app.storage.records import TooManyGoals, TooManyPhotos
-from app.storage.uploads import UploadNotStored, UploadRefused
-from app.storage.usage import StorageFull
 from osfcore.contrib.robots.robot import ConnectionLost, RobotRefused, RobotStopped
 from osfcore.errors import (
     CannotWrite,
@@ -57,6 +31,33 @@ from osfcore.errors import (
 from osfcore.extras import MissingExtra
 from osfcore.photo.table_layout import NoPhotographedTable
 from osfcore.plugins import BrokenPlugin
+
+from ..episodes.clip import NoClip
+from ..jobs.kinds.objects import MeshRefused
+from ..jobs.process import JobDied, JobStopped
+from ..jobs.registry import QueueFull, WrongJobState
+from ..processes.client import ProcessBusy, ProcessUnavailable
+from ..processes.photo_process import PhotoRefused
+from ..processes.server import InternalError, OutOfMemory
+from ..services.disturber import NoRoomToNudge
+from ..services.driver import NotDriving
+from ..services.episodes import EpisodeGoesOn, GoalUnknown, NoGoal, NoTrajectory
+from ..services.estimates import NoImages, NoPrior, NoScene
+from ..services.fields import MissingFields, NoPublishedField, NoTrainedField, ShippedField
+from ..services.goals import DraftUnsound, GoalRefused, NoDraft, NoPhoto, NoTable
+from ..services.image_sets import TooManySets
+from ..services.objects import CatalogueObject, ObjectNeeded, ObjectTaken
+from ..services.photos import NotFoundYet, NothingMarked, PhotoDoubtful
+from ..services.pushes import CannotExecute, NoPush, NothingToPush
+from ..services.robot import NoPicture, NoRobot, NothingAsked, RobotBusy
+from ..services.runner import SceneNeeded, SetInUse, TrainingAlready, WorkshopInUse
+from ..services.scenes import SceneHeld, TooManyScenes
+from ..storage.database import CannotStore
+from ..storage.paths import without_places
+from ..storage.records import TooManyGoals, TooManyPhotos
+from ..storage.uploads import UploadNotStored, UploadRefused
+from ..storage.usage import StorageFull
+from .dependencies import TooManyStreams
 
 _log = logging.getLogger(__name__)
 _MEDIA_TYPE = "application/problem+json"

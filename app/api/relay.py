@@ -18,13 +18,14 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from app.api.dependencies import Services, ServicesDep
-from app.api.guards.security import is_same_origin
-from app.api.guards.token_gate import RateLimit
-from app.api.guards.viewer_messages import BURST, CAMERA, DROP, RATE, allowed_kind
-from app.api.models import VISITOR, Visitor
-from app.viewer.private_server import PAGE_HEADER, SECRET_HEADER
 from osfcore.errors import shown
+
+from ..viewer.private_server import PAGE_HEADER, SECRET_HEADER
+from .dependencies import Services, ServicesDep
+from .guards.security import is_same_origin
+from .guards.token_gate import RateLimit
+from .guards.viewer_messages import BURST, CAMERA, DROP, RATE, allowed_kind
+from .models import VISITOR, Visitor
 
 router = APIRouter(include_in_schema=False)
 _PASSED_CLOSE_CODES = (1000, 1001, 1002, 1011, 1012)

@@ -8,16 +8,17 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Path, Response
 from pydantic import BaseModel, Field
 
-from app.api.bodies import JPEG, BoundedRoute
-from app.api.dependencies import VISITOR_HEADER, ServicesDep, only_the_driver, slow, urgent
-from app.api.jobs import JobOut
-from app.api.models import Box, Horizon, Input, ObjectNames, Samples, Steps, Visitor
-from app.api.problems import named_in_path, problems
-from app.episodes.settings import ChosenSettings
-from app.jobs.params import Identifier, Seed
-from app.services.robot import AskedDrive, CameraNow, RobotNow, State
-from app.storage.database import utc_of
 from osfcore.io.scene_file import CameraJson
+
+from ..episodes.settings import ChosenSettings
+from ..jobs.params import Identifier, Seed
+from ..services.robot import AskedDrive, CameraNow, RobotNow, State
+from ..storage.database import utc_of
+from .bodies import JPEG, BoundedRoute
+from .dependencies import VISITOR_HEADER, ServicesDep, only_the_driver, slow, urgent
+from .jobs import JobOut
+from .models import Box, Horizon, Input, ObjectNames, Samples, Steps, Visitor
+from .problems import named_in_path, problems
 
 
 class RobotSettingsIn(Input):

@@ -10,22 +10,23 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel, Field
 
-from app.api.bodies import PNG, BoundedRoute
-from app.api.dependencies import Services, ServicesDep, slow
-from app.api.models import Input, LightIn, ObjectNames, ObjectPose, Poses, Velocity
-from app.api.paging import DEFAULT_PAGE, AfterEntry, Limit, PageOut, page
-from app.api.problems import NotFound, named_in_path, problems
-from app.jobs.params import ImageSize, ObjectCount, Seed
-from app.processes.messages.neural_messages import CompareView, Comparison
-from app.processes.messages.scene_messages import SceneRecord, TakeImage, TakeMask
-from app.processes.render_cameras import scene_camera
-from app.services.disturber import Kind
-from app.services.fields import MissingFields
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.cameras import CAMERA_POSITIONS, DEFAULT_IMAGE_SIDE, default_cameras, goal_camera
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.scene_file import CameraJson, ObjectJson, PointJson
+
+from ..jobs.params import ImageSize, ObjectCount, Seed
+from ..processes.messages.neural_messages import CompareView, Comparison
+from ..processes.messages.scene_messages import SceneRecord, TakeImage, TakeMask
+from ..processes.render_cameras import scene_camera
+from ..services.disturber import Kind
+from ..services.fields import MissingFields
+from .bodies import PNG, BoundedRoute
+from .dependencies import Services, ServicesDep, slow
+from .models import Input, LightIn, ObjectNames, ObjectPose, Poses, Velocity
+from .paging import DEFAULT_PAGE, AfterEntry, Limit, PageOut, page
+from .problems import NotFound, named_in_path, problems
 
 
 class SceneIn(Input):

@@ -19,11 +19,11 @@ from prometheus_client.registry import Collector
 from pydantic import BaseModel, Field
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.api.dependencies import ServicesDep, urgent
-from app.api.episodes import ServiceSettings
-from app.api.problems import named_in_path, problems
-from app.jobs.kinds.fields import TrainFieldParams
-from app.services.runner import Runner
+from ..jobs.kinds.fields import TrainFieldParams
+from ..services.runner import Runner
+from .dependencies import ServicesDep, urgent
+from .episodes import ServiceSettings
+from .problems import named_in_path, problems
 
 LEAST_FREE_BYTES = 50 << 20  # on the disk of the data directory; with less, the next episode may not fit
 

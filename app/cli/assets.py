@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from app.cli.command import DataCommand, choice_of, follow, show_table
-from app.cli.workers import worker_pool
 from osfcore.errors import OsfError
+
+from .command import DataCommand, choice_of, follow, show_table
+from .workers import worker_pool
 
 if TYPE_CHECKING:
     from osfcore.objects.asset_library import AssetLibrary
@@ -109,7 +110,7 @@ Assets = choice_of(list=AssetsList, fetch=AssetsFetch, add=AssetsAdd)
 
 
 def _compile() -> None:
-    from app.jobs.kinds.rehearsal import rehearse
+    from ..jobs.kinds.rehearsal import rehearse
 
     rehearse()
 

@@ -7,9 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from app.cli.command import DataCommand, choice_of, report_of
 from osfcore.io.files import write_json
 from osfcore.io.output_paths import check_place
+
+from .command import DataCommand, choice_of, report_of
 
 _PICTURE = "render.png"
 

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand, choice_of, last_of, options_as
-from app.cli.workers import worker_pool
+from .command import Command, DataCommand, choice_of, last_of, options_as
+from .workers import worker_pool
 
 _IN_FLIGHT = 64  # episodes that a cluster is given at once
 

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar, Un
 
 import tyro
 
-from app.storage.paths import default_data_dir
 from osfcore.errors import InvalidInput
 from osfcore.io.output_paths import check_place
+
+from ..storage.paths import default_data_dir
 
 if TYPE_CHECKING:
     from osfcore.fields.field_library import FieldLibrary

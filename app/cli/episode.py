@@ -10,9 +10,10 @@ from typing import Any, Literal
 
 import tyro
 
-from app.cli.command import DataCommand, Device, last_of, report_of
 from osfcore.errors import check_seed
 from osfcore.io.output_paths import check_place
+
+from .command import DataCommand, Device, last_of, report_of
 
 
 @dataclass(frozen=True)
@@ -63,14 +64,15 @@ class RunEpisode(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Run it with a progress bar; the result is report.json without the single steps."""
-        from app.episodes.file_names import REPORT_FILE
-        from app.episodes.record import PartNames
-        from app.episodes.request import EpisodeOrder, run_episode
         from osfcore.control.events import CostKind, EpisodeSettings
         from osfcore.fields.devices import pick_device
         from osfcore.planning.mppi import PlanSettings
         from osfcore.world.simulators import default_simulator
         from osfcore.world.tabletop import WORLDS
+
+        from ..episodes.file_names import REPORT_FILE
+        from ..episodes.record import PartNames
+        from ..episodes.request import EpisodeOrder, run_episode
 
         plan = PlanSettings(self.samples, self.horizon, self.temperature)
         cost: CostKind = "image" if self.cost == "image" else "pose"
@@ -89,7 +91,7 @@ class RunEpisode(DataCommand):
 
 def _summary(report: dict[str, Any]) -> Iterator[str]:
     """What came of an episode, for people."""
-    from app.episodes.clip import length_text
+    from ..episodes.clip import length_text
 
     yield f"{report['text']} {report['steps_done']} actions, {report['seconds']:.0f} s."
     for notice in report["noticed"]:
@@ -111,7 +113,7 @@ class Clip(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Make it."""
-        from app.episodes.clip import FPS, clip_of
+        from ..episodes.clip import FPS, clip_of
 
         with ThreadPoolExecutor(2) as executor:
             last = last_of(clip_of(self.episode, self.assets, self.out, executor))
@@ -138,7 +140,7 @@ class LeRobot(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Write it."""
-        from app.episodes.lerobot import write_lerobot
+        from ..episodes.lerobot import write_lerobot
 
         size = write_lerobot(self.episodes, self.assets, self.out, obs=self.obs, image_side=self.image_side)
         self.say(f"{self.out}: {size.episodes} episodes, {size.frames} frames, {size.tasks} tasks")
@@ -159,7 +161,7 @@ class Mcap(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Write it."""
-        from app.episodes.mcap import write_mcap
+        from ..episodes.mcap import write_mcap
 
         check_place(self.out)
         seconds = write_mcap(self.episode, self.assets, self.out)
@@ -182,8 +184,8 @@ class Record(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Make them one after the other; return how each episode ended."""
-        from app.services.examples import PRESETS, preset
-        from app.services.story_recording import record_story
+        from ..services.examples import PRESETS, preset
+        from ..services.story_recording import record_story
 
         outcomes = {}
         for name in self.names or [one.id for one in PRESETS]:

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from app.cli.command import DataCommand, Device, check_out, follow, last_of
 from osfcore.errors import InvalidInput, check_seed, shown
 from osfcore.io.output_paths import check_place
 from osfcore.random_streams import Stream, stream_rng
+
+from .command import DataCommand, Device, check_out, follow, last_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,9 +47,10 @@ class Estimate(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Estimate; the result is what state.json holds, and how long it took."""
-        from app.jobs.kinds.estimates import load_models, steps_of
         from osfcore.io.observation_file import OBSERVATION_FILE, read_observation
         from osfcore.io.scene_file import estimated_to_json, read_estimated, write_estimated
+
+        from ..jobs.kinds.estimates import load_models, steps_of
 
         rng = stream_rng(check_seed(self.seed), Stream.FIRST_FRAME)
         check_out(self.out, ".json")

@@ -15,10 +15,11 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from app.cli.command import DataCommand, Seed, choice_of, report_of, show_table
-from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput
 from osfcore.extras import need
+
+from .command import DataCommand, Seed, choice_of, report_of, show_table
+from .workers import worker_pool
 
 if TYPE_CHECKING:
     from osfcore.experiments.reproduction.reproduction import Scale

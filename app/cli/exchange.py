@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import tyro
 
-from app.cli.command import Command, DataCommand, check_out, choice_of
 from osfcore.errors import CorruptFile, InvalidInput, OsfError
 from osfcore.geometry.light import Light
 from osfcore.io.files import folder_at_once, write_atomically, write_json
+
+from .command import Command, DataCommand, check_out, choice_of
 
 if TYPE_CHECKING:
     from osfcore.fields.field_library import FieldLibrary

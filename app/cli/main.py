@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from app.cli.command import Command
+    from .command import Command
 
 # For each command the class, or union of classes, in app/cli and a description. Modules may take more than a second, so
 # that only the command's own is imported.
@@ -88,7 +88,7 @@ def _parsed(arguments: list[str]) -> Command:
     if arguments and arguments[0] in COMMANDS:
         place, description = COMMANDS[arguments[0]]
         module, _, name = place.partition(":")
-        kind = getattr(import_module(f"app.cli.{module}"), name)
+        kind = getattr(import_module(f".{module}", __package__), name)
         return tyro.cli(kind, prog=f"osf {arguments[0]}", args=arguments[1:], description=description)
     kinds = [
         Annotated[make_dataclass(name, ()), tyro.conf.subcommand(name, description=description)]

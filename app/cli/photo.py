@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import tyro
 
-from app.cli.command import Command, DataCommand, check_out, choice_of, last_of
 from osfcore.errors import InvalidInput, UnknownName, shown
 from osfcore.io.files import write_atomically, write_json, writing
 from osfcore.io.json_codec import encode
@@ -21,6 +20,8 @@ from osfcore.photo.camera_files import read_camera
 from osfcore.photo.read_photograph import RawPhotograph, read_photograph, to_photograph
 from osfcore.photo.segmentation import Box, outline_doubt, propose_masks
 from osfcore.random_streams import Stream, stream_rng
+
+from .command import Command, DataCommand, check_out, choice_of, last_of
 
 if TYPE_CHECKING:
     from osfcore.geometry.poses import Pose

@@ -14,15 +14,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from app.cli.command import Command, DataCommand, Device, choice_of
 from osfcore.errors import InvalidInput, check_seed, shown
 from osfcore.io.output_paths import check_place
 
+from .command import Command, DataCommand, Device, choice_of
+
 if TYPE_CHECKING:
-    from app.episodes.robot import RobotDrive
     from osfcore.contrib.robots.guarded_world import CameraBoxes
     from osfcore.contrib.robots.robot import Robot, RobotDescription
     from osfcore.geometry.states import Observation
+
+    from ..episodes.robot import RobotDrive
 
 _LOOKS = 3
 _LISTENS_EVERY_S = 0.05
@@ -40,8 +42,9 @@ class RobotCheck(Command):
 
     def run(self) -> dict[str, Any]:
         """Look some times; the result has cameras, limits and how long a look takes."""
-        from app.episodes.robot import doubts_about
         from osfcore.contrib.robots.connect import connect
+
+        from ..episodes.robot import doubts_about
 
         overlay = None if self.out is None else self.out / "overlay.png"
         if overlay is not None:
@@ -114,8 +117,8 @@ class RobotDriveCommand(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Drive; the result is report.json without the single steps."""
-        from app.episodes.progress import EpisodeProgress
-        from app.episodes.robot import RobotDrive
+        from ..episodes.progress import EpisodeProgress
+        from ..episodes.robot import RobotDrive
 
         order = self._order()
         with contextlib.ExitStack() as opened:
@@ -142,12 +145,13 @@ class RobotDriveCommand(DataCommand):
         return {key: value for key, value in report.items() if key not in ("steps", "actions", "goal")}
 
     def _order(self) -> Any:  # noqa: ANN401  a DriveOrder, whose module is heavy
-        from app.episodes.file_names import REPORT_FILE
-        from app.episodes.robot import DriveOrder
         from osfcore.contrib.robots.robot import SafetyLimits
         from osfcore.control.events import EpisodeSettings
         from osfcore.fields.devices import pick_device
         from osfcore.planning.mppi import PlanSettings
+
+        from ..episodes.file_names import REPORT_FILE
+        from ..episodes.robot import DriveOrder
 
         plan = PlanSettings(self.samples, self.horizon)
         settings = EpisodeSettings(self.steps, plan=plan, despite_doubts=self.despite_doubts)

@@ -20,16 +20,17 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from app.cli.command import DataCommand
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.extras import need
+
+from .command import DataCommand
 
 if TYPE_CHECKING:
     from types import FrameType
 
     import uvicorn
 
-    from app.services.service_settings import Settings
+    from ..services.service_settings import Settings
 
 _BACKLOG = 128
 _MAX_FRAME_BYTES = 1 << 16  # from a browser to the 3D view
@@ -70,7 +71,7 @@ class Serve(DataCommand):
         """Serve until interrupted."""
         check_memory()
         need("serve", "This command")
-        from app.storage.database import check_data_dir
+        from ..storage.database import check_data_dir
 
         listener = bound_socket(self.host, self.port)
         with closing(listener):
@@ -139,8 +140,8 @@ def _settings(serve: Serve) -> tuple[Settings, str]:
     """
     from pydantic import SecretStr, ValidationError
 
-    from app.services.robot import host_of, limits_of
-    from app.services.service_settings import Settings
+    from ..services.robot import host_of, limits_of
+    from ..services.service_settings import Settings
 
     robot: dict[str, Any] = {"robot": serve.robot, "robot_box": serve.box, "robot_top_speed_m_s": serve.top_speed}
     given = {name: value for name, value in robot.items() if value is not None}  # the environment has the rest
@@ -171,9 +172,9 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
     """A server that prints its address once it is ready, and ends what keeps requests before it waits for them."""
     import uvicorn
 
-    from app.api.app_factory import create_app
-    from app.api.guards.connection_timeouts import PromptProtocol
-    from app.processes.child_process import end_children
+    from ..api.app_factory import create_app
+    from ..api.guards.connection_timeouts import PromptProtocol
+    from ..processes.child_process import end_children
 
     app = create_app(settings)
 
@@ -264,7 +265,7 @@ class Backup(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Write the backup; return what it holds."""
-        from app.storage.backup import back_up
+        from ..storage.backup import back_up
 
         manifest = back_up(self.data_dir, self.out)
         self.say(f"{self.out} holds {manifest.files} files ({manifest.bytes / 1e6:.1f} MB) of {self.data_dir}.")
@@ -280,7 +281,7 @@ class Restore(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Make the folder; return what it holds."""
-        from app.storage.backup import restore
+        from ..storage.backup import restore
 
         manifest = restore(self.archive, self.data_dir)
         self.say(f"{self.data_dir} holds the {manifest.files} files that were stored on {manifest.created_at}.")

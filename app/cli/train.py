@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from app.cli.command import Command, DataCommand, Device, Seed, choice_of, follow, options_as
-from app.cli.workers import worker_pool
 from osfcore.errors import InvalidInput
 from osfcore.io.output_paths import SUFFIX
+
+from .command import Command, DataCommand, Device, Seed, choice_of, follow, options_as
+from .workers import worker_pool
 
 if TYPE_CHECKING:
     from osfcore.fields.train_osf import FieldSettings

@@ -15,8 +15,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from app.episodes.file_names import GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
-from app.episodes.trajectory import LookFrame, Moment, ReplayClock, Trajectory, read_trajectory
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
@@ -28,6 +26,9 @@ from osfcore.io.video_file import mp4_at_once
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.planning.mppi import PlanSketch
 from osfcore.world.imaging import RayTracer, TracedMesh
+
+from .file_names import GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE
+from .trajectory import LookFrame, Moment, ReplayClock, Trajectory, read_trajectory
 
 WIDTH, HEIGHT = 1920, 1080
 VIEW = (40, 128, 1396, 700)  # left, top, width, height [px]

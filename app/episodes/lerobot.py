@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageOps
 
-from app.episodes.file_names import GOAL_FILE, REPORT_FILE
-from app.episodes.record import FinishedEpisode, read_episode
 from osfcore.contrib.export.lerobot import (
     GOAL_IMAGE,
     DatasetSize,
@@ -32,6 +30,9 @@ from osfcore.io.files import new_folder, reading_png
 from osfcore.io.image_file import to_uint8
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.imaging import RayTracer, TracedMesh
+
+from .file_names import GOAL_FILE, REPORT_FILE
+from .record import FinishedEpisode, read_episode
 
 Kind = Literal["poses", "pixels", "both"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

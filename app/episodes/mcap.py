@@ -28,9 +28,6 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from app.episodes.file_names import FRAMES_FOLDER, GOAL_FILE
-from app.episodes.record import read_episode
-from app.episodes.trajectory import Round, Trajectory
 from osfcore.extras import need
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
@@ -38,6 +35,10 @@ from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RA
 from osfcore.io.files import reading_png, write_atomically
 from osfcore.objects.asset import TexturedMesh
 from osfcore.objects.asset_library import AssetLibrary
+
+from .file_names import FRAMES_FOLDER, GOAL_FILE
+from .record import read_episode
+from .trajectory import Round, Trajectory
 
 need("mcap", "An MCAP file")
 import foxglove  # noqa: E402

@@ -14,9 +14,6 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from app.episodes.file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE, VIDEO_FILE
-from app.episodes.frames import TILE_PX, frame, read_frames, write_video
-from app.episodes.trajectory import ReplayClock, Trajectory, TrajectoryRecorder, read_trajectory, write_trajectory
 from osfcore.control.events import (
     ActionExecuted,
     EpisodeSettings,
@@ -39,6 +36,10 @@ from osfcore.metrics.image_errors import ssim
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.paper.method import Method
+
+from .file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE, VIDEO_FILE
+from .frames import TILE_PX, frame, read_frames, write_video
+from .trajectory import ReplayClock, Trajectory, TrajectoryRecorder, read_trajectory, write_trajectory
 
 _UNWRITTEN_SHARE = 0.05  # of the steps, at most
 

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import viser
 
-from app.viewer.nodes.room import add_room
-from app.viewer.nodes.scene_nodes import SceneNodes
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import STEP_S
 from osfcore.io.files import write_atomically
 from osfcore.objects.asset_library import AssetLibrary
+
+from ..viewer.nodes.room import add_room
+from ..viewer.nodes.scene_nodes import SceneNodes
 
 
 def write_recording(path: Path, library: AssetLibrary, states: Iterable[SceneState]) -> None:

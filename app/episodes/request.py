@@ -12,9 +12,6 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from app.episodes.file_names import RECORDING_FILE
-from app.episodes.progress import EpisodeProgress
-from app.episodes.record import About, EpisodeRecord, PartNames, recorded
 from osfcore.control.closed_loop import Episode
 from osfcore.control.estimators import ESTIMATOR, ESTIMATORS, EpisodeParts, load_scene_models
 from osfcore.control.events import EpisodeSettings, Event
@@ -39,6 +36,10 @@ from osfcore.world.scenes import SceneRequest
 from osfcore.world.simulators import default_simulator
 from osfcore.world.tabletop import WORLD, WORLDS, Tabletop, WorldInputs
 from osfcore.world.tasks import arranged_goal, random_goal
+
+from .file_names import RECORDING_FILE
+from .progress import EpisodeProgress
+from .record import About, EpisodeRecord, PartNames, recorded
 
 _MODES = ("L", "LA", "P", "RGB", "RGBA")  # Pillow's, of 8 bits a channel: others would be clipped silently
 
@@ -247,7 +248,7 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
     Raises:
         OsfError: if the order cannot be met, or the disk refuses.
     """
-    from app.episodes.recording import write_recording
+    from .recording import write_recording
 
     step = EpisodeStep(0, order.settings.steps, "Loading fields and setting the table")
     yield step

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from app.episodes.file_names import STOPPED
-from app.episodes.record import About, EpisodeRecord, recorded
 from osfcore.contrib.robots.connect import connect
 from osfcore.contrib.robots.guarded_world import CameraBoxes, GuardedWorld, OutlinedWorld
 from osfcore.contrib.robots.robot import RobotDescription, SafetyLimits
@@ -28,6 +26,9 @@ from osfcore.geometry.workspace import PUSHER_RADIUS_M
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.photo.read_photograph import read_photograph
 from osfcore.random_streams import Stream, stream_rng
+
+from .file_names import STOPPED
+from .record import About, EpisodeRecord, recorded
 
 _RADIUS_DIFFERS_M = 0.001  # a person is warned of more
 

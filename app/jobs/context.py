@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.processes.client import ProcessUnavailable
-from app.processes.messages.scene_messages import JobCommand
-from app.processes.server import Answer
 from osfcore.errors import OsfError
 from osfcore.objects.asset_library import AssetLibrary
+
+from ..processes.client import ProcessUnavailable
+from ..processes.messages.scene_messages import JobCommand
+from ..processes.server import Answer
 
 _LOOKS_EVERY_S = 0.05
 _ANSWER_S = 300.0  # the service gives its simulation three minutes, and others may be served first

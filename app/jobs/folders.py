@@ -8,9 +8,10 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
-from app.jobs.job import INPUTS
-from app.storage.database import CannotStore
 from osfcore.io.files import put_in_place, sync
+
+from ..storage.database import CannotStore
+from .job import INPUTS
 
 _TEMPORARY_PREFIX = ".new-"
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-from app.storage.database import now_utc
 from osfcore.errors import UnknownName
 from osfcore.io.json_codec import decode
+
+from ..storage.database import now_utc
 
 State = Literal["queued", "running", "paused", "done", "failed", "cancelled", "interrupted"]
 INPUTS = "inputs"  # in the folder of a job that was given files

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.jobs.params import JobParams
+from .params import JobParams
 
 if TYPE_CHECKING:
-    from app.jobs.context import JobContext
-    from app.jobs.job import Job
+    from .context import JobContext
+    from .job import Job
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,17 +13,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.context import JobCancelled, JobRests, JobStep, SceneCommand
-from app.jobs.folders import JobFolders, remove_half_made
-from app.jobs.job import Job, JobChanged, JobView, ended
-from app.jobs.kinds import KINDS
-from app.jobs.process import JobDied, JobProcess, JobStopped, Outcome
-from app.jobs.table import JobTable
-from app.processes.messages.scene_messages import JobCommand
-from app.processes.server import Answer, InternalError
-from app.storage.database import now_utc
 from osfcore.errors import OsfError, UnknownName
 from osfcore.io.files import sync_tree
+
+from ..processes.messages.scene_messages import JobCommand
+from ..processes.server import Answer, InternalError
+from ..storage.database import now_utc
+from .context import JobCancelled, JobRests, JobStep, SceneCommand
+from .folders import JobFolders, remove_half_made
+from .job import Job, JobChanged, JobView, ended
+from .kinds import KINDS
+from .process import JobDied, JobProcess, JobStopped, Outcome
+from .table import JobTable
 
 StartProcess = Callable[[Job, Path, Path, Callable[[object], None]], JobProcess]
 _RETRY_S = 1.0  # after a failure of the loop itself, and of writing what the disk has refused

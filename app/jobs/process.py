@@ -11,12 +11,13 @@ from concurrent.futures import TimeoutError as FutureTimeoutError
 from pathlib import Path
 from typing import Any
 
-from app.jobs.context import CancelJob, JobCancelled, RunJob
-from app.jobs.job import Job
-from app.jobs.kinds import KINDS
-from app.jobs.worker import job_main
-from app.processes.client import ProcessClient, ProcessFrozen, ProcessUnavailable
 from osfcore.errors import OsfError
+
+from ..processes.client import ProcessClient, ProcessFrozen, ProcessUnavailable
+from .context import CancelJob, JobCancelled, RunJob
+from .job import Job
+from .kinds import KINDS
+from .worker import job_main
 
 WHO = "job"
 _CHECK_S, _CANCELLED_CHECK_S = 0.2, 0.05

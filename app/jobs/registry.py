@@ -14,16 +14,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.context import ChangeJob, PauseJob, ResumeJob, StepJob
-from app.jobs.folders import JobFolders
-from app.jobs.job import Job, JobEvent, JobPage, State, ended
-from app.jobs.kinds import KINDS, in_words
-from app.jobs.loop import JobLoop, StartProcess, after, clear_cancelled
-from app.jobs.process import JobProcess, JobStopped
-from app.jobs.table import JobTable
-from app.processes.messages.scene_messages import JobCommand
-from app.storage.database import CannotStore, Store
 from osfcore.errors import OsfError
+
+from ..processes.messages.scene_messages import JobCommand
+from ..storage.database import CannotStore, Store
+from .context import ChangeJob, PauseJob, ResumeJob, StepJob
+from .folders import JobFolders
+from .job import Job, JobEvent, JobPage, State, ended
+from .kinds import KINDS, in_words
+from .loop import JobLoop, StartProcess, after, clear_cancelled
+from .process import JobProcess, JobStopped
+from .table import JobTable
 
 
 class WrongJobState(OsfError):

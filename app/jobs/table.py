@@ -9,11 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app.jobs.job import Job, JobChanged, JobEvent, JobForgotten, JobPage, job_fields, job_from_fields
-from app.jobs.kinds import check_stored
-from app.storage.database import Store
-from app.storage.paths import without_places
 from osfcore.errors import NotThere
+
+from ..storage.database import Store
+from ..storage.paths import without_places
+from .job import Job, JobChanged, JobEvent, JobForgotten, JobPage, job_fields, job_from_fields
+from .kinds import check_stored
 
 _EVENT_INTERVAL_S = 0.25  # progress is sent to pages no more often than this
 

@@ -8,11 +8,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from app.jobs.context import JobCancelled, JobContext, JobControl, JobRests, JobStep, RunJob
-from app.jobs.kinds import KINDS
-from app.processes.child_process import end_own_group, import_quietly, own_group
-from app.processes.server import ProcessServer
 from osfcore.errors import OsfError
+
+from ..processes.child_process import end_own_group, import_quietly, own_group
+from ..processes.server import ProcessServer
+from .context import JobCancelled, JobContext, JobControl, JobRests, JobStep, RunJob
+from .kinds import KINDS
 
 STEP_INTERVAL_S = 0.1
 _NOT_EXTRA = ("done", "total", "note", "view")  # fields of a step that are no part of the result
@@ -22,7 +23,7 @@ def _prepare() -> None:
     """Load code, and use it once."""
     for module in dict.fromkeys(module for kind in KINDS.values() for module in kind.preloads):
         import_quietly(module)
-    from app.jobs.kinds.rehearsal import rehearse
+    from .kinds.rehearsal import rehearse
 
     with contextlib.suppress(OsfError):  # a job that lacks what this lacks says so
         rehearse()

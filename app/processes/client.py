@@ -19,9 +19,10 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Literal
 
-from app.processes.child_process import end, launch
-from app.processes.server import Alive, Answer, Logged, Overtaken, Ready, Request, child_main
 from osfcore.errors import OsfError
+
+from .child_process import end, launch
+from .server import Alive, Answer, Logged, Overtaken, Ready, Request, child_main
 
 Status = Literal["starting", "ready", "restarting"]
 MAX_PENDING = 64

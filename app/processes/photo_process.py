@@ -11,8 +11,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from app.processes.child_process import limit_memory
-from app.processes.messages.photo_messages import (
+from osfcore.errors import CorruptFile, OsfError
+from osfcore.io.image_file import encode_png
+
+from .child_process import limit_memory
+from .messages.photo_messages import (
     AssessCamera,
     FindMask,
     Mark,
@@ -23,9 +26,7 @@ from app.processes.messages.photo_messages import (
     ReadPhoto,
     SightBoard,
 )
-from app.processes.server import ProcessServer
-from osfcore.errors import CorruptFile, OsfError
-from osfcore.io.image_file import encode_png
+from .server import ProcessServer
 
 if TYPE_CHECKING:
     from osfcore.photo.read_photograph import RawPhotograph

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.processes.messages.neural_messages import Order, Predicted, PredictPushes
-from app.processes.server import IsOvertaken, ProcessServer
 from osfcore.errors import OsfError
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.paper.method import Method
+
+from .messages.neural_messages import Order, Predicted, PredictPushes
+from .server import IsOvertaken, ProcessServer
 
 if TYPE_CHECKING:
     from osfcore.dynamics.dynamics_model import DynamicsModel

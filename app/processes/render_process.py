@@ -15,17 +15,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from app.processes.messages.neural_messages import (
-    CheckPhoto,
-    CompareView,
-    Comparison,
-    DrawnView,
-    DrawPhoto,
-    DrawView,
-    Order,
-)
-from app.processes.render_cameras import bands
-from app.processes.server import IsOvertaken, ProcessServer
 from osfcore.estimation.camera_response import linear_from_encoded, srgb_of_linear
 from osfcore.estimation.steps import ContentCheck
 from osfcore.fields.field_library import TABLE_NAME, FieldLibrary
@@ -33,6 +22,10 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import Observation, SceneState
 from osfcore.io.image_file import encode_png, to_uint8
 from osfcore.render.types import EXACT, PLANNING, Quality, SceneBatch
+
+from .messages.neural_messages import CheckPhoto, CompareView, Comparison, DrawnView, DrawPhoto, DrawView, Order
+from .render_cameras import bands
+from .server import IsOvertaken, ProcessServer
 
 if TYPE_CHECKING:
     from osfcore.estimation.content_check import ContentChecker

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from app.processes.child_process import silence_stdout
 from osfcore.errors import OsfError
+
+from .child_process import silence_stdout
 
 IsOvertaken = Callable[[], bool]
 ALIVE_S = 0.5

@@ -17,8 +17,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.processes.child_process import import_quietly
-from app.processes.messages.scene_messages import (
+from osfcore.errors import NotThere, OsfError, check_known
+from osfcore.geometry.cameras import default_cameras, goal_camera, image_side
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose
+from osfcore.geometry.states import Observation, SceneState
+from osfcore.geometry.workspace import STEP_S, check_action
+from osfcore.inspection.overlays import tint_masks
+from osfcore.io.image_file import encode_jpeg, encode_png, to_uint8
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.random_streams import Stream, stream_rng
+
+from .child_process import import_quietly
+from .messages.scene_messages import (
     Act,
     AdoptScene,
     Command,
@@ -41,18 +52,8 @@ from app.processes.messages.scene_messages import (
     UndoDisturbances,
     WatchFrames,
 )
-from app.processes.render_cameras import scene_camera
-from app.processes.server import IsOvertaken, ProcessServer
-from osfcore.errors import NotThere, OsfError, check_known
-from osfcore.geometry.cameras import default_cameras, goal_camera, image_side
-from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose
-from osfcore.geometry.states import Observation, SceneState
-from osfcore.geometry.workspace import STEP_S, check_action
-from osfcore.inspection.overlays import tint_masks
-from osfcore.io.image_file import encode_jpeg, encode_png, to_uint8
-from osfcore.objects.asset_library import AssetLibrary
-from osfcore.random_streams import Stream, stream_rng
+from .render_cameras import scene_camera
+from .server import IsOvertaken, ProcessServer
 
 if TYPE_CHECKING:
     from osfcore.world.tabletop import Tabletop

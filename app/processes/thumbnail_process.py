@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from app.processes.child_process import limit_memory
-from app.processes.server import ProcessServer
+from .child_process import limit_memory
+from .server import ProcessServer
 
 _MEMORY_BYTES = 3 << 30  # an object with the largest texture takes one
 

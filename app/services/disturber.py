@@ -8,14 +8,15 @@ from typing import Literal
 
 import numpy as np
 
-from app.processes.messages.scene_messages import Disturb, EditScene, SceneRecord
-from app.services.scenes import Scenes
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects
 from osfcore.geometry.cameras import default_cameras
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import WORKSPACE_HALF_M
+
+from ..processes.messages.scene_messages import Disturb, EditScene, SceneRecord
+from .scenes import Scenes
 
 Kind = Literal["turn lamp", "dim light", "nudge object", "cover camera"]
 _TURN_RAD = np.deg2rad((60.0, 150.0))

@@ -12,7 +12,17 @@ from typing import Any, Literal
 
 import cv2
 
-from app.episodes.file_names import (
+from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed, shown
+from osfcore.geometry.cameras import goal_camera
+from osfcore.geometry.poses import unit_quaternion
+from osfcore.geometry.states import SceneState
+from osfcore.io.files import file_at_once, read_json, write_atomically
+from osfcore.io.image_file import encode_png
+from osfcore.io.json_codec import Entry, decode
+from osfcore.io.scene_file import CameraJson, ObjectJson, StateJson
+from osfcore.paper.method import Method
+
+from ..episodes.file_names import (
     ARCHIVE_FILE,
     CLIP_FILE,
     CSV_FILE,
@@ -24,27 +34,18 @@ from app.episodes.file_names import (
     TRAJECTORY_FILE,
     VIDEO_FILE,
 )
-from app.episodes.frames import Part, part_of, read_frame, read_frames, write_video
-from app.episodes.settings import ChosenSettings
-from app.jobs.job import Job, JobPage
-from app.jobs.kinds.clips import ClipParams
-from app.jobs.kinds.episodes import EpisodeGoal, EpisodeParams
-from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
-from app.services.examples import Stories
-from app.services.fields import FieldCatalogue
-from app.services.goals import GOAL_SIDE, GoalChecks, Goals, NoTable
-from app.services.runner import Runner, fill_inputs
-from app.services.scenes import scene_or_current
-from app.storage.records import GoalRecord, Poses
-from osfcore.errors import InvalidInput, OsfError, UnknownName, check_seed, shown
-from osfcore.geometry.cameras import goal_camera
-from osfcore.geometry.poses import unit_quaternion
-from osfcore.geometry.states import SceneState
-from osfcore.io.files import file_at_once, read_json, write_atomically
-from osfcore.io.image_file import encode_png
-from osfcore.io.json_codec import Entry, decode
-from osfcore.io.scene_file import CameraJson, ObjectJson, StateJson
-from osfcore.paper.method import Method
+from ..episodes.frames import Part, part_of, read_frame, read_frames, write_video
+from ..episodes.settings import ChosenSettings
+from ..jobs.job import Job, JobPage
+from ..jobs.kinds.clips import ClipParams
+from ..jobs.kinds.episodes import EpisodeGoal, EpisodeParams
+from ..processes.messages.scene_messages import ComposeGoal, SceneRecord
+from ..storage.records import GoalRecord, Poses
+from .examples import Stories
+from .fields import FieldCatalogue
+from .goals import GOAL_SIDE, GoalChecks, Goals, NoTable
+from .runner import Runner, fill_inputs
+from .scenes import scene_or_current
 
 KIND, CLIP_KIND = "episode", "clip"
 _MOST_NAMES = 1000  # that a new one is compared with
@@ -350,7 +351,7 @@ class Episodes:
         elif name == VIDEO_FILE:
             write_video(path, read_frames(path.parent / FRAMES_FOLDER))
         else:
-            from app.episodes.recording import write_recording
+            from ..episodes.recording import write_recording
 
             write_recording(path, self._runner.library, read_json(path.with_name(REPORT_FILE), _as_states))
         return path

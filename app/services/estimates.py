@@ -15,8 +15,18 @@ from typing import Any
 import numpy as np
 from starlette.concurrency import run_in_threadpool
 
-from app.jobs.job import Job, JobPage
-from app.jobs.kinds.estimates import (
+from osfcore.errors import InvalidInput, OsfError, UnknownName, check_known, check_seed
+from osfcore.geometry.cameras import Camera
+from osfcore.geometry.states import EstimatedState, SceneState
+from osfcore.io.files import read_json, write_json, writing
+from osfcore.io.json_codec import decode
+from osfcore.io.observation_file import OBSERVATION_FILE, ObservationJson, write_observation
+from osfcore.io.scene_file import EstimateJson, read_estimated, read_scene, state_to_json, write_estimated
+from osfcore.objects.asset_library import AssetLibrary
+from osfcore.paper.method import Method
+
+from ..jobs.job import Job, JobPage
+from ..jobs.kinds.estimates import (
     OBSERVATION,
     PRIOR,
     STATE,
@@ -29,20 +39,11 @@ from app.jobs.kinds.estimates import (
     read_steps,
     state_of_step,
 )
-from app.processes.messages.neural_messages import CompareView
-from app.services.fields import FieldCatalogue
-from app.services.runner import Runner
-from app.services.scenes import scene_or_current
-from app.storage.uploads import Examiner, save
-from osfcore.errors import InvalidInput, OsfError, UnknownName, check_known, check_seed
-from osfcore.geometry.cameras import Camera
-from osfcore.geometry.states import EstimatedState, SceneState
-from osfcore.io.files import read_json, write_json, writing
-from osfcore.io.json_codec import decode
-from osfcore.io.observation_file import OBSERVATION_FILE, ObservationJson, write_observation
-from osfcore.io.scene_file import EstimateJson, read_estimated, read_scene, state_to_json, write_estimated
-from osfcore.objects.asset_library import AssetLibrary
-from osfcore.paper.method import Method
+from ..processes.messages.neural_messages import CompareView
+from ..storage.uploads import Examiner, save
+from .fields import FieldCatalogue
+from .runner import Runner
+from .scenes import scene_or_current
 
 KIND = "estimate"
 

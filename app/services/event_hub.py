@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from app.processes.messages.scene_messages import SceneRecord
+from ..processes.messages.scene_messages import SceneRecord
 
 _log = logging.getLogger(__name__)
 Listener = Callable[[object], None]

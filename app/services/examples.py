@@ -10,16 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from app.episodes.file_names import PREPARED_FILE, TRAJECTORY_FILE
-from app.processes.messages.scene_messages import SceneRecord
-from app.services.goals import Goals
-from app.services.runner import Runner
-from app.storage.paths import static_folder
-from app.storage.records import GoalRecord
 from osfcore.errors import OsfError, UnknownName
 from osfcore.geometry.light import Light
 from osfcore.geometry.states import shifted_poses
 from osfcore.io.files import as_mapping, read_json
+
+from ..episodes.file_names import PREPARED_FILE, TRAJECTORY_FILE
+from ..processes.messages.scene_messages import SceneRecord
+from ..storage.paths import static_folder
+from ..storage.records import GoalRecord
+from .goals import Goals
+from .runner import Runner
 
 # Six tables to begin with: objects, light, and how it should become
 

@@ -9,10 +9,11 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Literal
 
-from app.storage.field_files import install, uninstall, uninstall_published
 from osfcore.errors import OsfError
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldInfo, FieldLibrary
 from osfcore.paper.method import Method, own_field_path, paper_field_names
+
+from ..storage.field_files import install, uninstall, uninstall_published
 
 
 class ShippedField(OsfError):

@@ -14,21 +14,22 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from app.processes.client import ProcessClient, ProcessUnavailable
-from app.processes.messages.neural_messages import CheckPhoto
-from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
-from app.services.fields import FieldCatalogue, MissingFields
-from app.services.runner import Runner
-from app.services.scenes import Scenes, scene_or_current
-from app.storage.database import now_utc
-from app.storage.photos import Photo, PhotoCrop, PhotoReader, central_crop, check_crop, cut_out
-from app.storage.records import GoalRecord, GoalStore, PhotoRecord, Poses, Source
 from osfcore.errors import InvalidInput, OsfError, OverlappingObjects, UnknownName, check_known
 from osfcore.estimation.goal_view import is_goal_view
 from osfcore.estimation.steps import ContentCheck, Verdict
 from osfcore.geometry.cameras import Camera, goal_camera
 from osfcore.geometry.light import Light
 from osfcore.io.files import reading_png
+
+from ..processes.client import ProcessClient, ProcessUnavailable
+from ..processes.messages.neural_messages import CheckPhoto
+from ..processes.messages.scene_messages import ComposeGoal, SceneRecord
+from ..storage.database import now_utc
+from ..storage.photos import Photo, PhotoCrop, PhotoReader, central_crop, check_crop, cut_out
+from ..storage.records import GoalRecord, GoalStore, PhotoRecord, Poses, Source
+from .fields import FieldCatalogue, MissingFields
+from .runner import Runner
+from .scenes import Scenes, scene_or_current
 
 # Goals: photos of how the table should look, uploaded, composed by hand, or drawn at random
 

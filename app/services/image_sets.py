@@ -16,11 +16,12 @@ from typing import Annotated
 from pydantic import Field, StrictInt
 from starlette.concurrency import run_in_threadpool
 
-from app.storage.database import now_utc
-from app.storage.records import RecordFolders
-from app.storage.uploads import Examiner, save
 from osfcore.errors import CorruptFile, OsfError
 from osfcore.io.json_codec import Text
+
+from ..storage.database import now_utc
+from ..storage.records import RecordFolders
+from ..storage.uploads import Examiner, save
 
 _ARCHIVE, _IMAGES, _OVERLAY, _FACTS = "set.zip", "images", "overlay.png", "set.json"
 _TEMPORARY_PREFIX = ".new-"

@@ -10,17 +10,18 @@ from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 
-from app.jobs.job import Job
-from app.jobs.kinds.objects import UPLOAD, AddObjectParams, MeshRefused
-from app.processes.client import ProcessClient, ProcessUnavailable
-from app.processes.thumbnail_process import thumbnails_main
-from app.services.runner import RESERVED, Runner
-from app.storage.uploads import save
 from osfcore.errors import CannotWrite, CorruptFile, OsfError
 from osfcore.io.files import write_atomically
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.catalogue import CATALOGUE
 from osfcore.objects.fetch import NewObject
+
+from ..jobs.job import Job
+from ..jobs.kinds.objects import UPLOAD, AddObjectParams, MeshRefused
+from ..processes.client import ProcessClient, ProcessUnavailable
+from ..processes.thumbnail_process import thumbnails_main
+from ..storage.uploads import save
+from .runner import RESERVED, Runner
 
 # Objects that people add and delete: an uploaded mesh becomes a job, and one that is needed stays
 

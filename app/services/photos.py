@@ -12,39 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from app.jobs.job import Job
-from app.jobs.kinds.photos import FOUND, PhotoInput, PhotoParams, inputs_of
-from app.processes.client import ProcessClient, ProcessHangs
-from app.processes.messages.neural_messages import DrawPhoto
-from app.processes.messages.photo_messages import (
-    AssessCamera,
-    FindMask,
-    Mark,
-    MaskFound,
-    PhotoAnswer,
-    PhotoOrder,
-    PhotoRead,
-    ReadPhoto,
-    SightBoard,
-)
-from app.processes.messages.scene_messages import ComposeGoal, SceneRecord
-from app.processes.photo_process import PhotoRefused, photo_main
-from app.services.fields import FieldCatalogue
-from app.services.goals import Goals
-from app.services.runner import Runner, fill_inputs
-from app.storage.database import now_utc
-from app.storage.photos import GOAL_SIDE
-from app.storage.records import (
-    PICTURE,
-    STRAIGHT,
-    Files,
-    GoalRecord,
-    MarkedObject,
-    Poses,
-    TablePhoto,
-    TablePhotoStore,
-    mask_file,
-)
 from osfcore.errors import CorruptFile, InvalidInput, NoRoom, NotThere, OsfError, UnknownName, check_known, check_seed
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, rotation_angle
@@ -58,6 +25,40 @@ from osfcore.photo.camera_files import KnownCamera
 from osfcore.photo.found_scene import FoundScene
 from osfcore.photo.photograph import check_shared
 from osfcore.photo.table_layout import TableLayout, layout_of
+
+from ..jobs.job import Job
+from ..jobs.kinds.photos import FOUND, PhotoInput, PhotoParams, inputs_of
+from ..processes.client import ProcessClient, ProcessHangs
+from ..processes.messages.neural_messages import DrawPhoto
+from ..processes.messages.photo_messages import (
+    AssessCamera,
+    FindMask,
+    Mark,
+    MaskFound,
+    PhotoAnswer,
+    PhotoOrder,
+    PhotoRead,
+    ReadPhoto,
+    SightBoard,
+)
+from ..processes.messages.scene_messages import ComposeGoal, SceneRecord
+from ..processes.photo_process import PhotoRefused, photo_main
+from ..storage.database import now_utc
+from ..storage.photos import GOAL_SIDE
+from ..storage.records import (
+    PICTURE,
+    STRAIGHT,
+    Files,
+    GoalRecord,
+    MarkedObject,
+    Poses,
+    TablePhoto,
+    TablePhotoStore,
+    mask_file,
+)
+from .fields import FieldCatalogue
+from .goals import Goals
+from .runner import Runner, fill_inputs
 
 # Photographs of tables: taken in, marked by a person, and looked at by a job (`app.jobs.kinds.photos`)
 

@@ -14,13 +14,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from app.processes.client import ProcessClient
-from app.processes.messages.neural_messages import NeuralAnswer, Predicted, PredictPushes
-from app.processes.messages.scene_messages import SceneChanged, SceneRecord
-from app.services.estimates import errors_of
-from app.services.event_hub import CurrentScene, Hub
-from app.services.fields import MissingFields
-from app.services.scenes import Scenes, scene_or_current
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts, check_actions
@@ -28,6 +21,14 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import MAX_SPEED_M_S, PUSHER_REACH_M, STEP_S
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.paper.method import Method
+
+from ..processes.client import ProcessClient
+from ..processes.messages.neural_messages import NeuralAnswer, Predicted, PredictPushes
+from ..processes.messages.scene_messages import SceneChanged, SceneRecord
+from .estimates import errors_of
+from .event_hub import CurrentScene, Hub
+from .fields import MissingFields
+from .scenes import Scenes, scene_or_current
 
 MAX_ACTIONS = 50
 SPEED_M_S = 0.25  # of a push, unless another is asked for

@@ -15,22 +15,23 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from app.episodes.file_names import GOAL_FILE
-from app.episodes.settings import ChosenSettings
-from app.jobs.job import Job, JobChanged
-from app.jobs.kinds.robots import CameraPicture, RobotParams, read_picture
-from app.services.event_hub import Notice
-from app.services.fields import FieldCatalogue
-from app.services.goals import Goals
-from app.services.runner import Runner, fill_inputs
-from app.services.service_settings import Settings
-from app.storage.photos import PhotoReader
 from osfcore.contrib.robots.connect import check_address, connect
 from osfcore.contrib.robots.http_robot import KEPT_SIDE, HttpRobot
 from osfcore.contrib.robots.robot import RobotDescription, SafetyLimits
 from osfcore.errors import OsfError, check_known, check_unique, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_file import encode_jpeg
+
+from ..episodes.file_names import GOAL_FILE
+from ..episodes.settings import ChosenSettings
+from ..jobs.job import Job, JobChanged
+from ..jobs.kinds.robots import CameraPicture, RobotParams, read_picture
+from ..storage.photos import PhotoReader
+from .event_hub import Notice
+from .fields import FieldCatalogue
+from .goals import Goals
+from .runner import Runner, fill_inputs
+from .service_settings import Settings
 
 FRESH_S = 1.0  # the robot is not asked again before: for pictures, or whether it answers by now
 KIND = "robot"

@@ -12,23 +12,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.jobs.job import Job, JobChanged, JobEvent
-from app.jobs.kinds import KINDS, in_words
-from app.jobs.kinds.episodes import EpisodeParams
-from app.jobs.kinds.fields import TrainFieldParams
-from app.jobs.params import JobParams
-from app.jobs.process import JobProcess, Standby
-from app.jobs.registry import Jobs
-from app.services.event_hub import Hub, Notice
-from app.services.image_sets import ImageSets
-from app.services.scenes import DEMO_OBJECTS, Scenes
-from app.services.service_settings import Settings
-from app.storage.database import CannotStore, Store
-from app.storage.field_files import Leftover, remove_workshop, sweep, workshops
-from app.storage.usage import StorageMeter
 from osfcore.errors import InvalidInput, OsfError, UnknownName
 from osfcore.geometry.light import Light
 from osfcore.objects.asset_library import AssetLibrary, check_name
+
+from ..jobs.job import Job, JobChanged, JobEvent
+from ..jobs.kinds import KINDS, in_words
+from ..jobs.kinds.episodes import EpisodeParams
+from ..jobs.kinds.fields import TrainFieldParams
+from ..jobs.params import JobParams
+from ..jobs.process import JobProcess, Standby
+from ..jobs.registry import Jobs
+from ..storage.database import CannotStore, Store
+from ..storage.field_files import Leftover, remove_workshop, sweep, workshops
+from ..storage.usage import StorageMeter
+from .event_hub import Hub, Notice
+from .image_sets import ImageSets
+from .scenes import DEMO_OBJECTS, Scenes
+from .service_settings import Settings
 
 _PROBE_S = 5.0  # between two tries whether the disk takes something
 _STALE_S = 60.0  # after which the last try says nothing any more

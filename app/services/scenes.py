@@ -11,9 +11,17 @@ from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
-from app.jobs.params import MAX_SEED
-from app.processes.client import ProcessClient, Status
-from app.processes.messages.scene_messages import (
+from osfcore.errors import InvalidInput, NotThere, OsfError, check_unique
+from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
+from osfcore.geometry.light import Light
+from osfcore.geometry.poses import Pose, unit_quaternion
+from osfcore.geometry.states import MAX_OBJECTS
+from osfcore.geometry.workspace import check_action
+from osfcore.objects.asset_library import AssetLibrary
+
+from ..jobs.params import MAX_SEED
+from ..processes.client import ProcessClient, Status
+from ..processes.messages.scene_messages import (
     Act,
     AdoptScene,
     Command,
@@ -36,18 +44,11 @@ from app.processes.messages.scene_messages import (
     UndoDisturbances,
     WatchFrames,
 )
-from app.processes.sim_process import simulation_main
-from app.services.event_hub import CurrentScene, Hub, Notice
-from app.services.service_settings import Settings
-from app.storage.database import CannotStore, Store, now_utc
-from app.storage.records import Poses
-from osfcore.errors import InvalidInput, NotThere, OsfError, check_unique
-from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE, image_side
-from osfcore.geometry.light import Light
-from osfcore.geometry.poses import Pose, unit_quaternion
-from osfcore.geometry.states import MAX_OBJECTS
-from osfcore.geometry.workspace import check_action
-from osfcore.objects.asset_library import AssetLibrary
+from ..processes.sim_process import simulation_main
+from ..storage.database import CannotStore, Store, now_utc
+from ..storage.records import Poses
+from .event_hub import CurrentScene, Hub, Notice
+from .service_settings import Settings
 
 DEMO_OBJECTS = 3
 _LOST = "The simulation stopped unexpectedly and is being restarted."

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from app.storage.paths import default_data_dir
+from ..storage.paths import default_data_dir
 
 Names = Annotated[tuple[str, ...], NoDecode]
 

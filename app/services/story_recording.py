@@ -12,12 +12,6 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from app.episodes.file_names import FRAMES_FOLDER, PREPARED_FILE, REPORT_FILE, TRAJECTORY_FILE
-from app.episodes.frames import TILE_PX, part_of, read_frames
-from app.episodes.request import EpisodeOrder, EpisodeStep, run_episode
-from app.episodes.trajectory import LOOK_S, ReplayClock, read_trajectory
-from app.services.examples import STORY_FILE, Preset
-from app.services.goals import GOAL_SIDE
 from osfcore.control.estimators import load_scene_models
 from osfcore.control.events import GoalFound, Observed, Stepped
 from osfcore.control.goal import GoalImage
@@ -26,6 +20,13 @@ from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.states import EstimatedState, Observation
 from osfcore.io.files import as_mapping, read_json, write_atomically, write_json
 from osfcore.objects.asset_library import AssetLibrary
+
+from ..episodes.file_names import FRAMES_FOLDER, PREPARED_FILE, REPORT_FILE, TRAJECTORY_FILE
+from ..episodes.frames import TILE_PX, part_of, read_frames
+from ..episodes.request import EpisodeOrder, EpisodeStep, run_episode
+from ..episodes.trajectory import LOOK_S, ReplayClock, read_trajectory
+from .examples import STORY_FILE, Preset
+from .goals import GOAL_SIDE
 
 NOW_COLUMNS = 8  # of the grid of pictures
 _QUALITY = 82  # of WebP

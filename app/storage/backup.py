@@ -16,12 +16,13 @@ from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from app.storage.database import FILE, SCHEMA_VERSION, CannotStore, check_database, copy_database, now_utc
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, shown
 from osfcore.io.archives import ArchiveKind, unpack
 from osfcore.io.files import file_at_once, folder_at_once, read_json, writing
 from osfcore.io.json_codec import Entry, Text, decode
 from osfcore.io.output_paths import check_place
+
+from .database import FILE, SCHEMA_VERSION, CannotStore, check_database, copy_database, now_utc
 
 FOLDERS = ("objects", "fields", "goals", "photos", "sets", "collections", "training", "dynamics", "paper_fields")
 MANIFEST = "manifest.json"

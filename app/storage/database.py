@@ -27,12 +27,13 @@ from typing import IO, Annotated, Any
 
 from pydantic import Field, FiniteFloat
 
-from app.processes.messages.scene_messages import SceneRecord
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, shown
 from osfcore.geometry.cameras import image_side
 from osfcore.io.files import put_in_place, sync
 from osfcore.io.json_codec import Entry, Text, decode
 from osfcore.io.scene_file import StateJson, state_to_json
+
+from ..processes.messages.scene_messages import SceneRecord
 
 FILE = "service.sqlite3"
 _APPLICATION_ID = 0x4F534631  # "OSF1"

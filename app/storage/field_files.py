@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.storage.database import utc_of
-from app.storage.usage import folder_bytes
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE
 from osfcore.io.files import remove_folder, scratch_folder, sync, sync_tree, write_atomically, writing
+
+from .database import utc_of
+from .usage import folder_bytes
 
 _ORDER = "order.json"
 _TEMPORARY_PREFIX = ".writing-"

@@ -16,13 +16,14 @@ import numpy as np
 from jaxtyping import UInt8
 from pydantic import FiniteFloat
 
-from app.processes.child_process import limit_memory
-from app.processes.client import ProcessClient, ProcessHangs
-from app.processes.photo_process import PhotoRefused
-from app.processes.server import ProcessServer
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.geometry.cameras import Camera
 from osfcore.photo.read_photograph import MIN_SIDE, read_photograph
+
+from ..processes.child_process import limit_memory
+from ..processes.client import ProcessClient, ProcessHangs
+from ..processes.photo_process import PhotoRefused
+from ..processes.server import ProcessServer
 
 GOAL_SIDE = 512  # of goal images at most [px]: estimators look at less
 MAX_TURN_DEG = 180.0

@@ -23,9 +23,6 @@ from PIL import Image
 from pydantic import ConfigDict, Field, GetPydanticSchema
 from pydantic_core import core_schema
 
-from app.processes.messages.photo_messages import CameraSource, Mark, Points
-from app.storage.database import stamp, storing
-from app.storage.photos import PhotoCrop
 from osfcore.errors import CorruptFile, NotThere, OsfError, UnknownName, shown
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.poses import Pose, unit_quaternion
@@ -33,6 +30,10 @@ from osfcore.io.files import folder_at_once, is_file_name, put_in_place, read_js
 from osfcore.io.json_codec import Entry, Matrix3, Text, Vector3, Vector4, decode, encode
 from osfcore.io.scene_file import CameraJson, ObjectJson
 from osfcore.photo.found_scene import FoundScene
+
+from ..processes.messages.photo_messages import CameraSource, Mark, Points
+from .database import stamp, storing
+from .photos import PhotoCrop
 
 Poses = tuple[tuple[str, Pose], ...]
 Files = Mapping[str, bytes | None]  # of a record by name; None for one that is not there

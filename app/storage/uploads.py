@@ -14,12 +14,13 @@ from typing import Generic, TypeVar
 
 from starlette.concurrency import run_in_threadpool
 
-from app.processes.child_process import limit_memory, own_group
-from app.processes.client import ProcessClient, ProcessHangs, ProcessUnavailable
-from app.processes.server import ProcessServer
-from app.storage.database import storing
 from osfcore.errors import CannotWrite, CorruptFile, OsfError
 from osfcore.io.archives import check_zip
+
+from ..processes.child_process import limit_memory, own_group
+from ..processes.client import ProcessClient, ProcessHangs, ProcessUnavailable
+from ..processes.server import ProcessServer
+from .database import storing
 
 _WRITE_BYTES = 1 << 20
 _PATIENCE_S = 600.0

@@ -11,8 +11,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from app.storage.database import PUT_BACK, CannotStore, identities
 from osfcore.errors import OsfError
+
+from .database import PUT_BACK, CannotStore, identities
 
 FRESH_S = 30.0  # a figure that is older is measured anew with the next request
 _PATIENCE_S = 1.0  # longer than that, no request waits for a new figure

@@ -1,3 +1,3 @@
 """The live 3D view. This room and the relay are the only importers of viser."""
 
-from app.viewer.viewer import Viewer as Viewer
+from .viewer import Viewer as Viewer

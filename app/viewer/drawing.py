@@ -15,10 +15,11 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 
-from app.processes.messages.scene_messages import SceneChanged, SceneRecord
-from app.services.event_hub import CurrentScene
-from app.viewer.nodes.scene_nodes import Client, SceneNodes
 from osfcore.geometry.states import SceneState
+
+from ..processes.messages.scene_messages import SceneChanged, SceneRecord
+from ..services.event_hub import CurrentScene
+from .nodes.scene_nodes import Client, SceneNodes
 
 _log = logging.getLogger(__name__)
 RunCommand = Callable[[Callable[[], object], Client], None]

@@ -13,15 +13,16 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.services.event_hub import CurrentScene
-from app.services.goals import DraftChanged, Goals
-from app.viewer.drawing import Panel, RunCommand
-from app.viewer.nodes.episode_nodes import GOAL, add_copy
-from app.viewer.nodes.ghosts import size_m
-from app.viewer.nodes.room import NO_TURN, Colour, atomic, put, send_again
-from app.viewer.nodes.scene_nodes import Client, level_point
 from osfcore.geometry.poses import Pose, quaternion_multiply
 from osfcore.objects.asset_library import AssetLibrary
+
+from ..services.event_hub import CurrentScene
+from ..services.goals import DraftChanged, Goals
+from .drawing import Panel, RunCommand
+from .nodes.episode_nodes import GOAL, add_copy
+from .nodes.ghosts import size_m
+from .nodes.room import NO_TURN, Colour, atomic, put, send_again
+from .nodes.scene_nodes import Client, level_point
 
 WRONG = (225, 30, 35)
 _RING_BESIDE_M = 0.015  # of the copy, which is what a hand takes where both are

@@ -9,20 +9,21 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from app.jobs.job import Job, JobChanged, JobView
-from app.jobs.kinds.estimates import EstimateParams
-from app.processes.messages.scene_messages import SceneChanged
-from app.services import episodes, estimates
-from app.services.event_hub import CurrentScene
-from app.services.goals import DraftChanged
-from app.viewer.drawing import Panel
-from app.viewer.nodes.episode_nodes import EpisodeNodes
-from app.viewer.nodes.estimate_nodes import EstimateNodes
 from osfcore.control.events import GoalFound, Looking, Stepped
 from osfcore.estimation.steps import EstimateStep
 from osfcore.geometry.states import EstimatedState
 from osfcore.planning.costs import PoseGoal
 from osfcore.planning.mppi import PlanSketch
+
+from ..jobs.job import Job, JobChanged, JobView
+from ..jobs.kinds.estimates import EstimateParams
+from ..processes.messages.scene_messages import SceneChanged
+from ..services import episodes, estimates
+from ..services.event_hub import CurrentScene
+from ..services.goals import DraftChanged
+from .drawing import Panel
+from .nodes.episode_nodes import EpisodeNodes
+from .nodes.estimate_nodes import EstimateNodes
 
 ESTIMATE_INTERVAL_S, EPISODE_INTERVAL_S = 0.1, 0.08  # least time between two drawings
 

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
-from app.processes.client import ProcessClient
-from app.processes.messages.neural_messages import DrawnView, DrawView, NeuralAnswer
-from app.processes.render_cameras import view_camera
-from app.viewer.drawing import Panel
 from osfcore.errors import OsfError
 from osfcore.geometry.cameras import Camera
 from osfcore.geometry.states import SceneState
+
+from ..processes.client import ProcessClient
+from ..processes.messages.neural_messages import DrawnView, DrawView, NeuralAnswer
+from ..processes.render_cameras import view_camera
+from .drawing import Panel
 
 WARM_UP = "The renderer is loading, which can take half a minute the first time; until then you see meshes."
 _LATE_S = 1.0

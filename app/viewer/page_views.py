@@ -18,20 +18,21 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.episodes.trajectory import LookFrame, Moment, ReplayClock, Round, Trajectory, read_trajectory
-from app.processes.client import ProcessClient
-from app.services.event_hub import CurrentScene
-from app.storage.records import GoalRecord
-from app.viewer.drawing import Panel
-from app.viewer.neural_panel import NeuralPanel
-from app.viewer.nodes.episode_nodes import EpisodeNodes, add_copy
-from app.viewer.nodes.estimate_nodes import TRACKED
-from app.viewer.nodes.room import VIEW_FOV_RAD, atomic, framing
-from app.viewer.nodes.scene_nodes import LAMP, LIVE_NODES, SceneNodes, extent_m, pointed_at
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import SceneState
 from osfcore.objects.asset_library import AssetLibrary
+
+from ..episodes.trajectory import LookFrame, Moment, ReplayClock, Round, Trajectory, read_trajectory
+from ..processes.client import ProcessClient
+from ..services.event_hub import CurrentScene
+from ..storage.records import GoalRecord
+from .drawing import Panel
+from .neural_panel import NeuralPanel
+from .nodes.episode_nodes import EpisodeNodes, add_copy
+from .nodes.estimate_nodes import TRACKED
+from .nodes.room import VIEW_FOV_RAD, atomic, framing
+from .nodes.scene_nodes import LAMP, LIVE_NODES, SceneNodes, extent_m, pointed_at
 
 DRAW_INTERVAL_S = 0.04
 _ROOT, _CHOSEN = "/replay", "/chosen"

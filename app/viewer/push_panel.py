@@ -12,12 +12,13 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.services.pushes import Push, PushChanged, Pushes
-from app.viewer.drawing import Panel, RunCommand
-from app.viewer.nodes.push_nodes import PushNodes
-from app.viewer.nodes.scene_nodes import level_point
 from osfcore.geometry.workspace import PUSHER_REACH_M, STEP_S
 from osfcore.objects.asset_library import AssetLibrary
+
+from ..services.pushes import Push, PushChanged, Pushes
+from .drawing import Panel, RunCommand
+from .nodes.push_nodes import PushNodes
+from .nodes.scene_nodes import level_point
 
 TICK_S = 0.03  # between two pictures of a moving ghost
 

@@ -16,29 +16,30 @@ from pathlib import Path
 
 import viser
 
-from app.jobs.job import JobChanged
-from app.processes.client import ProcessClient
-from app.processes.messages.scene_messages import SceneRecord
-from app.services.driver import DriverChanged
-from app.services.event_hub import CurrentScene
-from app.services.goals import DraftChanged, Goals
-from app.services.pushes import Pushes
-from app.services.runner import Runner
-from app.storage.paths import without_places
-from app.storage.records import Poses
-from app.viewer.drawing import DrawingThread, Panel, Playback
-from app.viewer.goal_panel import GoalPanel
-from app.viewer.job_panels import EpisodePanel, EstimatePanel
-from app.viewer.nodes.episode_nodes import EpisodeNodes
-from app.viewer.nodes.estimate_nodes import EstimateNodes
-from app.viewer.nodes.room import add_room
-from app.viewer.nodes.scene_nodes import Client, SceneNodes
-from app.viewer.page_views import PageViews
-from app.viewer.private_server import PrivateViser
-from app.viewer.push_panel import PushPanel
 from osfcore.errors import OsfError
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
+
+from ..jobs.job import JobChanged
+from ..processes.client import ProcessClient
+from ..processes.messages.scene_messages import SceneRecord
+from ..services.driver import DriverChanged
+from ..services.event_hub import CurrentScene
+from ..services.goals import DraftChanged, Goals
+from ..services.pushes import Pushes
+from ..services.runner import Runner
+from ..storage.paths import without_places
+from ..storage.records import Poses
+from .drawing import DrawingThread, Panel, Playback
+from .goal_panel import GoalPanel
+from .job_panels import EpisodePanel, EstimatePanel
+from .nodes.episode_nodes import EpisodeNodes
+from .nodes.estimate_nodes import EstimateNodes
+from .nodes.room import add_room
+from .nodes.scene_nodes import Client, SceneNodes
+from .page_views import PageViews
+from .private_server import PrivateViser
+from .push_panel import PushPanel
 
 _AFTER_LEAVING_S, _RELEASE_INTERVAL_S = 1.0, 5.0  # when memory of browsers that have left is freed, at most so often
 _log = logging.getLogger(__name__)

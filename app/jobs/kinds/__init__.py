@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-from app.jobs.job import Job
-from app.jobs.kind import JobKind
-from app.jobs.kinds.clips import CLIP
-from app.jobs.kinds.collections import COLLECT_OBJECT, COLLECT_PUSHES, COLLECT_TABLE, FETCH_ASSETS
-from app.jobs.kinds.episodes import EPISODE
-from app.jobs.kinds.estimates import ESTIMATE
-from app.jobs.kinds.fields import TRAIN_FIELD
-from app.jobs.kinds.objects import ADD_OBJECT
-from app.jobs.kinds.photos import PHOTO
-from app.jobs.kinds.robots import ROBOT
 from osfcore.errors import InvalidInput, shown
+
+from ..job import Job
+from ..kind import JobKind
+from .clips import CLIP
+from .collections import COLLECT_OBJECT, COLLECT_PUSHES, COLLECT_TABLE, FETCH_ASSETS
+from .episodes import EPISODE
+from .estimates import ESTIMATE
+from .fields import TRAIN_FIELD
+from .objects import ADD_OBJECT
+from .photos import PHOTO
+from .robots import ROBOT
 
 KindName = Literal[
     "collect_pushes", "collect_object", "collect_table", "fetch_assets", "add_object", "train_field", "estimate",

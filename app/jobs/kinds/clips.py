@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-from app.episodes.file_names import CLIP_FILE
-from app.jobs.kind import JobKind
-from app.jobs.params import JobParams
+from ...episodes.file_names import CLIP_FILE
+from ..kind import JobKind
+from ..params import JobParams
 
 if TYPE_CHECKING:
-    from app.episodes.clip import ClipStep
-    from app.jobs.context import JobContext
+    from ...episodes.clip import ClipStep
+    from ..context import JobContext
 
 _THREADS = 2  # the parts of the view
 
@@ -26,7 +26,7 @@ class ClipParams(JobParams):
 
 def clip_job(params: ClipParams, place: JobContext) -> Iterator[ClipStep]:
     """Draw the episode named "episode"; raises what `clip_of` does."""
-    from app.episodes.clip import clip_of
+    from ...episodes.clip import clip_of
 
     folder = place.folder.parent / params.episode
     with ThreadPoolExecutor(_THREADS) as executor:

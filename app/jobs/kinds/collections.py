@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from app.jobs.kind import JobKind
-from app.jobs.params import ImageCount, ImageSize, JobParams, ObjectCount, ObjectName, Seed
 from osfcore.errors import InvalidInput
 from osfcore.geometry.cameras import DEFAULT_IMAGE_SIDE
 from osfcore.io.files import file_at_once
 from osfcore.objects.catalogue import DEFAULT_NAMES
 from osfcore.objects.fetch import fetch, source_from
 
+from ..kind import JobKind
+from ..params import ImageCount, ImageSize, JobParams, ObjectCount, ObjectName, Seed
+
 if TYPE_CHECKING:
-    from app.jobs.context import JobContext
+    from ..context import JobContext
 
 _WORDS = "data collection"
 

@@ -17,13 +17,6 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import model_validator
 
-from app.episodes.file_names import GOAL_FILE, PREPARED_FILE, RECORDING_FILE
-from app.episodes.progress import EpisodeProgress, TimeLeft
-from app.episodes.settings import ChosenSettings, StoredSettings
-from app.jobs.job import INPUTS
-from app.jobs.kind import JobKind
-from app.jobs.params import JobParams
-from app.processes.messages.scene_messages import Act, JobCommand, ObservedScene, ObserveScene, SceneRecord, TakeView
 from osfcore.control.events import EpisodeSettings, Event, Looking, Observed, Planning, Stepped
 from osfcore.control.world import World
 from osfcore.errors import OsfError
@@ -40,10 +33,19 @@ from osfcore.planning.costs import PoseGoal
 from osfcore.planning.mppi import PlanSketch, sketch_of
 from osfcore.random_streams import Stream, stream_rng
 
+from ...episodes.file_names import GOAL_FILE, PREPARED_FILE, RECORDING_FILE
+from ...episodes.progress import EpisodeProgress, TimeLeft
+from ...episodes.settings import ChosenSettings, StoredSettings
+from ...processes.messages.scene_messages import Act, JobCommand, ObservedScene, ObserveScene, SceneRecord, TakeView
+from ..job import INPUTS
+from ..kind import JobKind
+from ..params import JobParams
+
 if TYPE_CHECKING:
-    from app.jobs.context import JobContext
     from osfcore.control.estimators import SceneModels
     from osfcore.control.goal import GoalImage
+
+    from ..context import JobContext
 
 _STAYS_M, _STAYS_RAD = 0.005, 0.1  # an object this close to its goal did not have to move
 
@@ -126,13 +128,14 @@ def episode_job(params: EpisodeParams, place: JobContext) -> Iterator[EpisodeJob
     Raises:
         OsfError: if an object has no field, the goal does not fit, the simulation is gone, or the disk refuses.
     """
-    from app.episodes.look_pictures import LookPictures
-    from app.episodes.record import About, EpisodeRecord, recorded
-    from app.episodes.recording import write_recording
     from osfcore.control.closed_loop import Episode
     from osfcore.control.goal import GoalImage
     from osfcore.control.prepared import prepared_from_json
     from osfcore.fields.devices import use_one_thread
+
+    from ...episodes.look_pictures import LookPictures
+    from ...episodes.record import About, EpisodeRecord, recorded
+    from ...episodes.recording import write_recording
 
     assert place.orders is not None, "the job's process sets it"
     use_one_thread()
@@ -212,8 +215,9 @@ def _drawn(event: Event) -> Event | PlanSketch | None:
 
 def _goal(given: EpisodeGoal, names: tuple[str, ...], inputs: Path) -> GoalImage | PoseGoal:
     """The goal image among the inputs, or the poses in the parameters, with a photograph of them if there is one."""
-    from app.episodes.request import read_goal
     from osfcore.control.goal import PhotoGoal
+
+    from ...episodes.request import read_goal
 
     image = None if given.camera is None else read_goal(inputs / GOAL_FILE, given.camera.camera())
     if given.poses is None:

@@ -15,9 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from app.jobs.job import INPUTS
-from app.jobs.kind import JobKind
-from app.jobs.params import JobParams
 from osfcore.errors import CorruptFile, InvalidInput
 from osfcore.estimation.steps import EstimateStep
 from osfcore.fields.field_library import FieldLibrary
@@ -28,9 +25,14 @@ from osfcore.io.scene_file import StateJson, read_estimated, state_to_json, writ
 from osfcore.paper.method import Method
 from osfcore.random_streams import Stream, stream_rng
 
+from ..job import INPUTS
+from ..kind import JobKind
+from ..params import JobParams
+
 if TYPE_CHECKING:
-    from app.jobs.context import JobContext
     from osfcore.estimation.objective import ObjectModels
+
+    from ..context import JobContext
 
 Mode = Literal["first", "next", "goal"]
 OBSERVATION, PRIOR, TRUTH = "observation", "prior.json", "truth.json"

@@ -18,10 +18,6 @@ import numpy as np
 from jaxtyping import UInt8
 from pydantic import Field, model_validator
 
-from app.jobs.job import Job
-from app.jobs.kind import JobKind
-from app.jobs.params import Identifier, ImageCount, JobParams, ObjectName, Seed
-from app.storage.field_files import clear_workshop, install, install_published, open_workshop
 from osfcore.errors import CorruptFile
 from osfcore.estimation.camera_response import srgb_of_linear
 from osfcore.fields.field_library import FIELD_FILE, METRICS_FILE, FieldLibrary
@@ -31,8 +27,13 @@ from osfcore.io.image_file import to_uint8, write_png
 from osfcore.paper.method import Method, own_field_path
 from osfcore.progress import Progress
 
+from ...storage.field_files import clear_workshop, install, install_published, open_workshop
+from ..job import Job
+from ..kind import JobKind
+from ..params import Identifier, ImageCount, JobParams, ObjectName, Seed
+
 if TYPE_CHECKING:
-    from app.jobs.context import JobContext
+    from ..context import JobContext
 
 PREVIEW, COMPARISON = "preview.png", "comparison.png"
 _COMPARING = "Comparing it with the field that is there"

@@ -8,16 +8,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from app.jobs.job import INPUTS
-from app.jobs.kind import JobKind
-from app.jobs.params import JobParams
-from app.processes.child_process import limit_memory
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.objects.fetch import NewObject, make_asset
 from osfcore.progress import Progress
 
+from ...processes.child_process import limit_memory
+from ..job import INPUTS
+from ..kind import JobKind
+from ..params import JobParams
+
 if TYPE_CHECKING:
-    from app.jobs.context import JobContext
+    from ..context import JobContext
 
 UPLOAD = "mesh"  # in the inputs of the job
 _MEMORY_BYTES = 4 << 30  # 200,000 triangles with the largest texture take 2.5 GB

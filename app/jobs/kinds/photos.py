@@ -15,9 +15,6 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from app.jobs.job import INPUTS
-from app.jobs.kind import JobKind
-from app.jobs.params import JobParams
 from osfcore.fields.field_library import FieldLibrary
 from osfcore.geometry.poses import Pose
 from osfcore.io.files import write_json
@@ -25,10 +22,15 @@ from osfcore.io.json_codec import Entry, Matrix3, Matrix4, Text, Vector4, encode
 from osfcore.progress import Progress
 from osfcore.random_streams import Stream, stream_rng
 
+from ..job import INPUTS
+from ..kind import JobKind
+from ..params import JobParams
+
 if TYPE_CHECKING:
-    from app.jobs.context import JobContext
     from osfcore.photo.photograph import Photograph
     from osfcore.photo.poses import PhotoModels, PhotoObject
+
+    from ..context import JobContext
 
 FOUND = "found.json"
 

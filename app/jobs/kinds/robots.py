@@ -15,12 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 from urllib.parse import quote
 
-from app.episodes.file_names import CAMERAS_FOLDER, GOAL_FILE, REPORT_FILE, STOPPED
-from app.episodes.progress import EpisodeProgress
-from app.episodes.settings import StoredSettings
-from app.jobs.job import INPUTS, Job
-from app.jobs.kind import JobKind
-from app.jobs.params import JobParams
 from osfcore.contrib.robots.robot import ConnectionLost, SafetyLimits
 from osfcore.control.events import Finished, Observed, Planning
 from osfcore.errors import OsfError
@@ -29,9 +23,16 @@ from osfcore.geometry.states import Observation
 from osfcore.io.files import as_mapping, read_json, write_atomically, write_json
 from osfcore.io.image_file import encode_jpeg, to_uint8
 
+from ...episodes.file_names import CAMERAS_FOLDER, GOAL_FILE, REPORT_FILE, STOPPED
+from ...episodes.progress import EpisodeProgress
+from ...episodes.settings import StoredSettings
+from ..job import INPUTS, Job
+from ..kind import JobKind
+from ..params import JobParams
+
 if TYPE_CHECKING:
-    from app.episodes.robot import RobotDrive
-    from app.jobs.context import JobContext
+    from ...episodes.robot import RobotDrive
+    from ..context import JobContext
 
 Drives = Literal["looking", "asked", "driving", "over", "lost"]
 _CANCELLED = "somebody stopped it"
@@ -88,8 +89,9 @@ def robot_job(params: RobotParams, place: JobContext) -> Iterator[RobotProgress]
     Raises:
         OsfError: if the order cannot be met, the robot does not answer or was stopped, or the disk refuses.
     """
-    from app.episodes.robot import DriveOrder, RobotDrive
     from osfcore.fields.devices import use_one_thread
+
+    from ...episodes.robot import DriveOrder, RobotDrive
 
     assert place.orders is not None, "the job's process sets it"
     use_one_thread()

@@ -9,13 +9,14 @@ import numpy as np
 import viser
 from jaxtyping import Float, UInt8
 
-from app.viewer.nodes.estimate_nodes import EstimateNodes
-from app.viewer.nodes.ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of, segments, shell
-from app.viewer.nodes.room import GAMMA, NO_LINES, Colour, Target, atomic, colour_of
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.planning.mppi import PlanSketch
+
+from .estimate_nodes import EstimateNodes
+from .ghosts import FINE_CELLS, PREDICTED, FutureNodes, FutureStyle, mesh_of, segments, shell
+from .room import GAMMA, NO_LINES, Colour, Target, atomic, colour_of
 
 GOAL = (245, 140, 0)
 CHEAP, DEAR = (45, 215, 90), (150, 62, 58)

@@ -10,24 +10,14 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.nodes.ghosts import (
-    Mesh,
-    add_ghosts,
-    box,
-    footprint_m,
-    heading_rad,
-    mesh_of,
-    move_ghosts,
-    sector,
-    spread,
-    top_m,
-)
-from app.viewer.nodes.room import AT, LIGHT_COLOUR, NO_TURN, Colour, LightMarker, Target, atomic, separated
 from osfcore.estimation.steps import UNPLACED_BELOW_M
 from osfcore.geometry.light import Light
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import EstimatedState, SceneState
 from osfcore.objects.asset_library import AssetLibrary
+
+from .ghosts import Mesh, add_ghosts, box, footprint_m, heading_rad, mesh_of, move_ghosts, sector, spread, top_m
+from .room import AT, LIGHT_COLOUR, NO_TURN, Colour, LightMarker, Target, atomic, separated
 
 GHOSTS = 24  # candidates of each object that are drawn
 GUESS = (20, 120, 200)

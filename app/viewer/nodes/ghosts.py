@@ -11,12 +11,13 @@ import numpy as np
 import viser
 from jaxtyping import Float, Float32, Int
 
-from app.viewer.nodes.room import NO_TURN, Colour
 from osfcore.errors import OsfError
 from osfcore.geometry.poses import Pose, rotate, rotation_angle
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.workspace import PUSHER_HEIGHT_M, PUSHER_RADIUS_M
 from osfcore.objects.asset_library import AssetLibrary
+
+from .room import NO_TURN, Colour
 
 CELLS, FINE_CELLS = 14, 28  # along the longest side of an object; a coarse ghost has some hundred triangles
 PREDICTED, TRUE = (190, 50, 210), (25, 25, 25)  # neither is a colour of estimates

@@ -9,23 +9,13 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.nodes.ghosts import (
-    FINE_CELLS,
-    PREDICTED,
-    TRUE,
-    FutureNodes,
-    FutureStyle,
-    mesh_of,
-    moves,
-    segments,
-    top_m,
-    way_of,
-)
-from app.viewer.nodes.room import NO_LINES, atomic
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.rollouts import Rollouts
 from osfcore.geometry.states import SceneState
 from osfcore.objects.asset_library import AssetLibrary
+
+from .ghosts import FINE_CELLS, PREDICTED, TRUE, FutureNodes, FutureStyle, mesh_of, moves, segments, top_m, way_of
+from .room import NO_LINES, atomic
 
 TRAIL = 5  # pale ghosts between start and end
 _STYLE = FutureStyle(PREDICTED, opacity=0.5, on_the_way=TRAIL, pale=0.26, has_end=False)

@@ -11,19 +11,6 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from app.viewer.nodes.ghosts import UNKNOWN_M, Mesh, box, size_m
-from app.viewer.nodes.room import (
-    AT,
-    GAMMA,
-    LAMP_COLOUR,
-    NO_TURN,
-    LightMarker,
-    Target,
-    atomic,
-    colour_of,
-    put,
-    send_again,
-)
 from osfcore.errors import OsfError
 from osfcore.geometry.light import AMBIENT, DIFFUSE, MIN_LIGHT_ELEVATION_DEG, Light
 from osfcore.geometry.poses import Pose, quaternion_multiply, quaternion_to_matrix
@@ -31,6 +18,9 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.imaging import TABLE_ALBEDO
+
+from .ghosts import UNKNOWN_M, Mesh, box, size_m
+from .room import AT, GAMMA, LAMP_COLOUR, NO_TURN, LightMarker, Target, atomic, colour_of, put, send_again
 
 # Everything that is drawn of the live table, here and elsewhere; the room around it is not.
 LIVE_NODES = (
