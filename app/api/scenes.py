@@ -15,6 +15,7 @@ from osfcore.geometry.cameras import CAMERA_POSITIONS, DEFAULT_IMAGE_SIDE, defau
 from osfcore.geometry.poses import Pose
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.io.scene_file import CameraJson, ObjectJson, PointJson
+from osfcore.world.simulators import Simulator
 
 from ..jobs.params import ImageSize, ObjectCount, Seed
 from ..processes.messages.neural_messages import CompareView, Comparison
@@ -84,14 +85,16 @@ class SceneOut(BaseModel):
     cameras: list[CameraJson]
     image_size: int = Field(description="[px]")
     revision: int = Field(description="Grows with every change.")
+    simulator: Simulator = Field(description="What moves the objects.")
 
     @staticmethod
-    def of(record: SceneRecord, labels: dict[str, str], *, is_current: bool) -> SceneOut:
+    def of(record: SceneRecord, labels: dict[str, str], simulator: Simulator, *, is_current: bool) -> SceneOut:
         """From the simulation's record.
 
         Args:
             record: of the scene.
             labels: of objects, by name.
+            simulator: what moves them.
             is_current: whether viewer and page show this scene.
         """
         state = record.state
@@ -107,6 +110,7 @@ class SceneOut(BaseModel):
             cameras=_cameras(record.image_size),
             image_size=record.image_size,
             revision=record.revision,
+            simulator=simulator,
         )
 
 
@@ -274,7 +278,8 @@ async def _taken(services: Services, command: TakeImage | TakeMask) -> bytes:
 
 def scene_out(services: Services, record: SceneRecord) -> SceneOut:
     """A scene as it is answered."""
-    return SceneOut.of(record, services.objects.labels(), is_current=record.id == services.runner.scenes.current)
+    scenes = services.runner.scenes
+    return SceneOut.of(record, services.objects.labels(), scenes.simulator, is_current=record.id == scenes.current)
 
 
 def record_of(services: Services, scene: str) -> SceneRecord:

@@ -67,8 +67,6 @@ class RunEpisode(DataCommand):
         from osfcore.control.events import CostKind, EpisodeSettings
         from osfcore.fields.devices import pick_device
         from osfcore.planning.mppi import PlanSettings
-        from osfcore.world.simulators import default_simulator
-        from osfcore.world.tabletop import WORLDS
 
         from ..episodes.file_names import REPORT_FILE
         from ..episodes.record import PartNames
@@ -77,12 +75,11 @@ class RunEpisode(DataCommand):
         plan = PlanSettings(self.samples, self.horizon, self.temperature)
         cost: CostKind = "image" if self.cost == "image" else "pose"
         settings = EpisodeSettings(self.steps, self.replan_every, cost, plan, despite_doubts=self.despite_doubts)
-        simulator = self.simulator or (default_simulator() if self.world in WORLDS else None)
         check_place(self.out / REPORT_FILE)
         order = EpisodeOrder(
             self.out, self.data_dir, self.names, self.objects, check_seed(self.seed), self.goal, self.found, self.moved,
             settings=settings, device=str(pick_device(self.device)),
-            parts=PartNames(self.world, self.estimator, self.planner, self.cost, simulator),
+            parts=PartNames(self.world, self.estimator, self.planner, self.cost), simulator=self.simulator,
         )  # fmt: skip
         report = report_of(run_episode(order))
         self.say(*_summary(report), f"Report, frames, video and recording: {self.out}")

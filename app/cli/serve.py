@@ -16,7 +16,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -66,6 +66,9 @@ class Serve(DataCommand):
     """x0 y0 x1 y1 [m] that the robot's pusher stays in, besides its own; 0.35 m to each side without it."""
     top_speed: float | None = None
     """Of the robot's pusher [m/s]; 0.1 without it."""
+
+    simulator: Literal["pybullet", "mujoco"] | None = None
+    """What moves the objects; PyBullet where it is installed, else MuJoCo."""
 
     def run(self) -> dict[str, Any]:
         """Serve until interrupted."""
@@ -140,17 +143,21 @@ def _settings(serve: Serve) -> tuple[Settings, str]:
     """
     from pydantic import SecretStr, ValidationError
 
+    from osfcore.world.simulators import check_simulator
+
     from ..services.robot import host_of, limits_of
     from ..services.service_settings import Settings
 
     robot: dict[str, Any] = {"robot": serve.robot, "robot_box": serve.box, "robot_top_speed_m_s": serve.top_speed}
-    given = {name: value for name, value in robot.items() if value is not None}  # the environment has the rest
+    chosen = {**robot, "simulator": serve.simulator}
+    given = {name: value for name, value in chosen.items() if value is not None}  # the environment has the rest
     try:
         settings = Settings(host=serve.host, port=serve.port, data_dir=serve.data_dir, **given)
     except ValidationError as error:
         first = error.errors()[0]
         name = "OSF_" + "_".join(str(part) for part in first["loc"]).upper()
         raise InvalidInput(name, repr(first["input"])[:60], f"valid ({first['msg']})") from None
+    check_simulator(settings.simulator)
     limits_of(settings)
     if settings.robot is not None:
         host_of(settings.robot)

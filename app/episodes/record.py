@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -36,6 +36,7 @@ from osfcore.metrics.image_errors import ssim
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
 from osfcore.paper.method import Method
+from osfcore.world.simulators import Simulator
 
 from .file_names import CSV_FILE, FRAMES_FOLDER, GOAL_FILE, REPORT_FILE, TRAJECTORY_FILE, VIDEO_FILE
 from .frames import TILE_PX, frame, read_frames, write_video
@@ -65,14 +66,12 @@ class PartNames:
         estimator: what looks.
         planner: what plans.
         cost: what compares futures; None for what the settings say.
-        simulator: what moves the objects of our own world; None for PyBullet where it is installed, else MuJoCo.
     """
 
     world: str = "simulated"
     estimator: str = "ours"
     planner: str = "mppi"
     cost: str | None = None
-    simulator: Literal["pybullet", "mujoco"] | None = None
 
     def to_json(self) -> dict[str, str]:
         """Those that are named."""
@@ -93,6 +92,7 @@ class About:
         method: whose.
         image: the goal, where a method looks at the image alone: it finds no poses in it.
         parts: of the episode, where they were chosen by name.
+        simulator: what moves the objects; None where that is no simulator of ours.
         robot: what the report says of a robot; of a simulation nothing.
     """
 
@@ -105,6 +105,7 @@ class About:
     method: Method = "ours"
     image: GoalImage | None = None
     parts: PartNames | None = None
+    simulator: Simulator | None = None
     robot: Callable[[], Mapping[str, Any]] = dict
 
 
@@ -310,6 +311,8 @@ class EpisodeRecord:
             report["step_s"] = [round(at_s, 3) for at_s in times]
         if about.parts is not None:
             report["parts"] = about.parts.to_json()
+        if about.simulator is not None:
+            report["simulator"] = about.simulator
         if about.goal is not None:
             report["moved"] = list(about.moved)
             if about.moved and self._table is not None and self._course is not None:

@@ -33,7 +33,7 @@ from osfcore.planning.parts import COST, COSTS, PLANNER, PLANNERS
 from osfcore.plugins import part_factory
 from osfcore.random_streams import Stream, stream_rng
 from osfcore.world.scenes import SceneRequest
-from osfcore.world.simulators import default_simulator
+from osfcore.world.simulators import Simulator, default_simulator
 from osfcore.world.tabletop import WORLD, WORLDS, Tabletop, WorldInputs
 from osfcore.world.tasks import arranged_goal, random_goal
 
@@ -64,6 +64,7 @@ class EpisodeOrder:
         settings: how it goes.
         device: that computes.
         parts: that it is made of.
+        simulator: what moves the objects of our own worlds; None for PyBullet where it is installed, else MuJoCo.
     """
 
     out: Path
@@ -81,6 +82,7 @@ class EpisodeOrder:
     settings: EpisodeSettings = field(default_factory=EpisodeSettings)
     device: str = "cpu"
     parts: PartNames = field(default_factory=PartNames)
+    simulator: Simulator | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -132,7 +134,7 @@ def given(order: EpisodeOrder) -> Given:
         fields.info(name)
     among = tuple(name for name in fields.names() if assets.has(name))
     make = part_factory(WORLD, order.parts.world, WORLDS)
-    simulator = order.parts.simulator or default_simulator()
+    simulator = order.simulator or default_simulator()
     world = make(WorldInputs(assets, SceneRequest(names, order.objects, order.light, among), simulator))
     try:
         if not isinstance(world, Tabletop):
@@ -259,7 +261,11 @@ def run_episode(order: EpisodeOrder) -> Iterator[EpisodeStep]:
         names = begin.world.truth().names
         models = load_scene_models(names, FieldLibrary(order.data_dir), assets, order.data_dir, order.device)
         symmetries = {name: assets.info(name).symmetry for name in names}
-        about = About(names, order.seed, order.settings, begin.truth, begin.moved, symmetries, parts=order.parts)
+        simulator = (order.simulator or default_simulator()) if isinstance(begin.world, Tabletop) else None
+        about = About(
+            names, order.seed, order.settings, begin.truth, begin.moved, symmetries, parts=order.parts,
+            simulator=simulator,
+        )  # fmt: skip
         record = EpisodeRecord(order.out, SimulatedTable(begin.world), about)
         rng = stream_rng(order.seed, Stream.EPISODE)
         events = Episode(begin.world, models, begin.goal, order.settings, rng, parts=parts).run()

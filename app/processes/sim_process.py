@@ -56,6 +56,8 @@ from .render_cameras import scene_camera
 from .server import IsOvertaken, ProcessServer
 
 if TYPE_CHECKING:
+    from osfcore.world.scenes import SceneRequest
+    from osfcore.world.simulators import Simulator
     from osfcore.world.tabletop import Tabletop
 
 STATES_HZ = 60.0
@@ -64,11 +66,11 @@ MAX_FRAME_SIDE = 192  # live images larger than this cost more than they show
 _log = logging.getLogger(__name__)
 
 
-def simulation_main(server: ProcessServer, objects_root: Path, max_live_worlds: int) -> None:
+def simulation_main(server: ProcessServer, objects_root: Path, max_live_worlds: int, simulator: Simulator) -> None:
     """Carry out commands until the service has gone; `server` is the pipe to it, the others as in `Simulation`."""
     import_quietly("osfcore.world.tabletop")  # slow, so before the simulation calls itself ready
     with ThreadPoolExecutor(os.cpu_count() or 1) as executor:
-        simulation = Simulation(server.send, AssetLibrary(objects_root), executor, max_live_worlds)
+        simulation = Simulation(server.send, AssetLibrary(objects_root), executor, max_live_worlds, simulator)
         try:
             server.serve(simulation.carry_out, idle=simulation.idle)
         finally:
@@ -83,15 +85,22 @@ class Simulation:
         library: the objects.
         executor: for ray tracing.
         max_live_worlds: scenes whose simulation stays in memory.
+        simulator: moves the objects.
     """
 
     def __init__(
-        self, send: Callable[[object], None], library: AssetLibrary, executor: ThreadPoolExecutor, max_live_worlds: int
+        self,
+        send: Callable[[object], None],
+        library: AssetLibrary,
+        executor: ThreadPoolExecutor,
+        max_live_worlds: int,
+        simulator: Simulator,
     ) -> None:
         self._send = send
         self._library = library
         self._executor = executor
         self._max_live_worlds = max_live_worlds
+        self._simulator: Simulator = simulator
         self._records: dict[str, SceneRecord] = {}
         self._worlds: OrderedDict[str, Tabletop] = OrderedDict()
         self._time_offsets: dict[str, float] = {}
@@ -194,10 +203,8 @@ class Simulation:
 
     def _create(self, command: CreateScene) -> SceneRecord:
         from osfcore.world.scenes import SceneRequest
-        from osfcore.world.tabletop import Tabletop
 
-        request = SceneRequest(command.names, command.count, command.light)
-        world = Tabletop(self._library, request=request, executor=self._executor)
+        world = self._table(SceneRequest(command.names, command.count, command.light))
         try:
             if command.poses is None:
                 world.arrange(command.seed)
@@ -221,16 +228,22 @@ class Simulation:
     def _world(self, scene: str) -> Tabletop:
         """The scene's simulation, loaded from its record if it is not in memory."""
         from osfcore.world.scenes import SceneRequest
-        from osfcore.world.tabletop import Tabletop
 
         record = self._record(scene)
         if scene in self._worlds:
             self._worlds.move_to_end(scene)
             return self._worlds[scene]
-        world = Tabletop(self._library, request=SceneRequest(record.state.names), executor=self._executor)
+        world = self._table(SceneRequest(record.state.names))
         world.restore(record.state)
         self._keep_world(scene, world, time_offset_s=record.time_s)
         return world
+
+    def _table(self, request: SceneRequest) -> Tabletop:
+        from osfcore.world.scenes import Conditions
+        from osfcore.world.tabletop import Tabletop
+
+        conditions = Conditions(simulator=self._simulator)
+        return Tabletop(self._library, request=request, conditions=conditions, executor=self._executor)
 
     def _keep_world(self, scene: str, world: Tabletop, *, time_offset_s: float) -> None:
         self._worlds[scene] = world

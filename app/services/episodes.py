@@ -136,7 +136,10 @@ class Episodes:
         kept = None if goal is None else self._goals.get(goal)
         with self._runner.jobs.new_inputs() as folder:
             title, wanted = self._new_name(kept, names), self._goal(kept, poses, settings.method, table, folder)
-            params = EpisodeParams(scene=table.id, title=title, names=names, seed=seed, settings=settings, goal=wanted)
+            params = EpisodeParams(
+                scene=table.id, title=title, names=names, seed=seed, settings=settings, goal=wanted,
+                simulator=self._runner.scenes.simulator,
+            )  # fmt: skip
             job = self._runner.submit_with_inputs(KIND, params, folder)
         self._goals.drop_draft()  # what is composed cannot be moved while the episode has the scene
         return job

@@ -18,6 +18,7 @@ from osfcore.geometry.poses import Pose, unit_quaternion
 from osfcore.geometry.states import MAX_OBJECTS
 from osfcore.geometry.workspace import check_action
 from osfcore.objects.asset_library import AssetLibrary
+from osfcore.world.simulators import Simulator
 
 from ..jobs.params import MAX_SEED
 from ..processes.client import ProcessClient, Status
@@ -90,7 +91,7 @@ class Scenes:
         self._settings, self._store, self._library, self._hub, self._holder = settings, store, library, hub, holder
         self._simulation = ProcessClient(
             simulation_main,
-            (library.root, settings.max_live_worlds),
+            (library.root, settings.max_live_worlds, settings.simulator),
             "simulation",
             answer_s=settings.stage_timeout_s,
             keeps_running=True,
@@ -123,6 +124,11 @@ class Scenes:
     def status(self) -> Status:
         """Whether scenes can be worked with."""
         return self._simulation.status
+
+    @property
+    def simulator(self) -> Simulator:
+        """What moves the objects."""
+        return self._settings.simulator
 
     def all(self) -> tuple[SceneRecord, ...]:
         """All scenes, oldest first."""

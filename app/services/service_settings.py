@@ -8,6 +8,8 @@ from typing import Annotated
 from pydantic import Field, SecretStr, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from osfcore.world.simulators import Simulator, default_simulator
+
 from ..storage.paths import default_data_dir
 
 Names = Annotated[tuple[str, ...], NoDecode]
@@ -35,6 +37,9 @@ class Settings(BaseSettings):
         default=None, description="x0, y0, x1, y1 [m] that its pusher's centre stays in, as JSON."
     )
     robot_top_speed_m_s: float = Field(default=0.1, description="Of its pusher.")
+    simulator: Simulator = Field(
+        default_factory=default_simulator, description="What moves the objects; PyBullet where it is installed."
+    )
     demo_scene: bool = Field(default=True, description="Whether a scene is made when there is none.")
     max_body_bytes: int = Field(default=4 << 20, ge=1024)  # a thousand sequences of thirty actions in full precision
     max_upload_bytes: int = Field(default=1 << 30, ge=1024, description="Of a zipped image set or observation.")

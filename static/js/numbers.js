@@ -3,6 +3,8 @@ import { byId, el } from "./dom.js";
 import { current, watch } from "./state.js";
 import { toast } from "./toasts.js";
 
+const SIMULATORS = { pybullet: "PyBullet", mujoco: "MuJoCo" };
+
 const cm = (metres) => (100 * metres).toFixed(1);
 
 function row(object) {
@@ -44,6 +46,6 @@ export function setUpNumbers() {
     byId("poses").replaceChildren(...scene.objects.map(row));
     const at = scene.pusher?.position;
     byId("pusher-position").textContent = at ? `at ${cm(at[0])}, ${cm(at[1])} cm` : "parked";
-    byId("scene-facts").textContent = `Seed ${scene.seed}, ${scene.time_s.toFixed(1)} s of simulated time.`;
+    byId("scene-facts").textContent = `Seed ${scene.seed}, ${scene.time_s.toFixed(1)} s of simulated time by ${SIMULATORS[scene.simulator]}.`;
   });
 }

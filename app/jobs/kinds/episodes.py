@@ -32,6 +32,7 @@ from osfcore.paper.mppi import GaussianPlanSettings
 from osfcore.planning.costs import PoseGoal
 from osfcore.planning.mppi import PlanSketch, sketch_of
 from osfcore.random_streams import Stream, stream_rng
+from osfcore.world.simulators import Simulator
 
 from ...episodes.file_names import GOAL_FILE, PREPARED_FILE, RECORDING_FILE
 from ...episodes.progress import EpisodeProgress, TimeLeft
@@ -105,6 +106,7 @@ class EpisodeParams(JobParams):
         seed: of the searches.
         settings: at the beginning, or what they were changed to.
         goal: what the table shall look like.
+        simulator: what moves the objects; None in records of earlier versions.
     """
 
     scene: str
@@ -113,6 +115,7 @@ class EpisodeParams(JobParams):
     seed: int
     settings: StoredSettings
     goal: EpisodeGoal
+    simulator: Simulator | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -150,7 +153,10 @@ def episode_job(params: EpisodeParams, place: JobContext) -> Iterator[EpisodeJob
     prepared = read_json(known, prepared_from_json) if known.is_file() else None
     image = wanted if method == "paper" else None
     assert image is None or isinstance(image, GoalImage), "the service renders poses for it"
-    about = About(names, params.seed, settings, target, _moved(start, target), models.symmetries, method, image)
+    about = About(
+        names, params.seed, settings, target, _moved(start, target), models.symmetries, method, image,
+        simulator=params.simulator,
+    )  # fmt: skip
     record = EpisodeRecord(place.folder, world, about)
     if image is None:
         loop = Episode(world, models, wanted, settings, rng, prepared=prepared)

@@ -12,6 +12,7 @@ from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.workspace import STEP_S
 from osfcore.io.scene_file import CameraJson
 from tests.app.api.test_problems import is_problem
+from tests.app.conftest import running
 from tests.app.storage.test_database import record
 from tests.support.errors import about
 
@@ -58,6 +59,14 @@ def test_exact_poses_and_light_are_taken(service):
         assert np.allclose(told["quaternion"], UPRIGHT, atol=1e-9)
     assert np.allclose(made["light"]["position"], [0, 0.5**0.5, 0.5**0.5])
     service.delete(f"/api/scenes/{made['id']}")
+
+
+def test_the_simulator_that_was_chosen_moves_things_and_is_told(library, tmp_path):
+    with running(library, tmp_path, simulator="mujoco") as client:
+        made = client.post("/api/scenes", json={"seed": 4, "count": 1}).json()
+        pushed = client.post(f"/api/scenes/{made['id']}/actions", json={"actions": [[0.1, 0.0, 0.0]]}).json()
+    assert made["simulator"] == "mujoco"
+    assert pushed["time_s"] > 0
 
 
 def test_a_new_scene_is_shown_and_can_be_left_again(service, scene):
@@ -202,13 +211,13 @@ def test_an_image_of_a_scene_deleted_meanwhile_is_not_found(service, services, s
 
 def test_a_scene_says_what_the_record_says():
     kept = record()
-    out = SceneOut.of(kept, {"x": "Box"}, is_current=True)
+    out = SceneOut.of(kept, {"x": "Box"}, "mujoco", is_current=True)
     assert [o.label for o in out.objects] == ["Box", "y"]
     assert out.objects[1].position == [0.3, 0.0, 0.1]
     assert [c.name for c in out.cameras] == ["0", "1", "2", "3", "goal"]
     assert {(c.width, c.height) for c in out.cameras} == {(128, 128)}
     assert out.pusher is not None
-    assert SceneOut.of(record(pusher=None), {}, is_current=False).pusher is None
+    assert SceneOut.of(record(pusher=None), {}, "mujoco", is_current=False).pusher is None
 
 
 def test_cameras_project_as_the_core_does():

@@ -229,6 +229,12 @@ def test_addresses_that_are_none_are_told():
         bound_socket("no.such.host.invalid", 8000)
 
 
+def test_a_simulator_that_is_not_installed_is_told_at_once(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("osfcore.world.simulators.find_spec", lambda name: None)
+    assert main(["serve", "--port", "0", "--data-dir", str(tmp_path), "--simulator", "mujoco"]) == 1
+    assert "mujoco" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

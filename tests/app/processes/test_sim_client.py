@@ -10,6 +10,7 @@ from app.processes.messages.scene_messages import Act, AdoptScene, CreateScene, 
 from app.processes.sim_process import simulation_main
 from osfcore.errors import OverlappingObjects, UnknownName
 from osfcore.geometry.poses import Pose
+from osfcore.world.simulators import default_simulator
 from tests.app.conftest import until
 from tests.support.errors import about
 
@@ -39,7 +40,7 @@ def desk():
 def simulation(library, desk, answer_s=30.0):
     return ProcessClient(
         simulation_main,
-        (library.root, 2),
+        (library.root, 2, default_simulator()),
         "simulation",
         answer_s=answer_s,
         keeps_running=True,

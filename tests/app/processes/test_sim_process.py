@@ -41,11 +41,11 @@ BOX, BOTTLE = "003_cracker_box", "006_mustard_bottle"
 class Director:
     """The other end of a simulation that runs in a thread."""
 
-    def __init__(self, library, max_live_worlds):
+    def __init__(self, library, max_live_worlds, simulator):
         self._ours, self._theirs = Pipe()
         self._executor = ThreadPoolExecutor(2)
         server = ProcessServer(self._theirs, "simulation")
-        self._simulation = Simulation(server.send, library, self._executor, max_live_worlds)
+        self._simulation = Simulation(server.send, library, self._executor, max_live_worlds, simulator)
         serve = {"idle": self._simulation.idle}
         self._thread = Thread(target=server.serve, args=(self._simulation.carry_out,), kwargs=serve)
         self._thread.start()
@@ -75,9 +75,10 @@ class Director:
         self._theirs.close()
 
 
-@pytest.fixture
-def director(library):
-    director = Director(library, max_live_worlds=1)
+@pytest.fixture(params=["pybullet", "mujoco"])
+def director(request, library):
+    pytest.importorskip(request.param)
+    director = Director(library, max_live_worlds=1, simulator=request.param)
     yield director
     director.close()
 
