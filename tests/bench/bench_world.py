@@ -1,4 +1,4 @@
-"""How fast the simulated tabletop is: observations, actions, scenes, episodes. Run alone on the machine.
+"""How fast the simulated tabletop is, by each simulator: observations, actions, scenes, episodes. Run alone.
 
 python -m tests.bench.bench_world [--data-dir DIR] [--episodes 60]
 """
@@ -9,9 +9,10 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import tyro
@@ -20,7 +21,8 @@ from app.storage.paths import default_data_dir
 from osfcore.geometry.cameras import default_cameras
 from osfcore.objects.asset_library import AssetLibrary
 from osfcore.world.collect_pushes import CollectPushes, collect_pushes
-from osfcore.world.scenes import SceneRequest
+from osfcore.world.scenes import Conditions, SceneRequest
+from osfcore.world.simulators import Simulator
 from osfcore.world.tabletop import Tabletop
 from osfcore.world.tiny_renderer import TinyScene
 from tests.bench.machine import machine
@@ -75,37 +77,38 @@ def observations(library: AssetLibrary, scenes: int) -> None:
         plain.close()
 
 
-def physics(library: AssetLibrary) -> None:
+def physics(library: AssetLibrary, simulator: Simulator) -> None:
     """Scenes and actions."""
     for count in (3, 8):
         if count > len(library.names()):
             continue
-        world = Tabletop(library, request=SceneRequest(count=count))
+        world = Tabletop(library, request=SceneRequest(count=count), conditions=Conditions(simulator=simulator))
         world.arrange(0)
         arrange = np.median([milliseconds(partial(world.arrange, seed), 1) for seed in range(10)])
         actions = np.column_stack([np.random.default_rng(0).uniform(-0.3, 0.3, (50, 2)), np.zeros(50)])
         act = np.median([milliseconds(partial(world.act, action), 1) for action in actions])
         print(
-            f"{count} objects: new scene {arrange:.0f} ms, action of 0.2 s {act:.1f} ms ({200 / act:.0f} x real time)"
+            f"{simulator}, {count} objects: new scene {arrange:.0f} ms, "
+            f"action of 0.2 s {act:.1f} ms ({200 / act:.0f} x real time)"
         )
         world.close()
 
 
-def episodes(library: AssetLibrary, count: int) -> None:
+def episodes(library: AssetLibrary, count: int, simulator: Simulator) -> None:
     """Collecting pushes with two workers; processes are started before the clock."""
     for policy in ("paper", "directed"):
         with (
             tempfile.TemporaryDirectory() as folder,
             ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as executor,
         ):
-            warm = CollectPushes(Path(folder) / "warm.h5", episodes=8, policy=policy)
+            warm = CollectPushes(Path(folder) / "warm.h5", episodes=8, policy=policy, simulator=simulator)
             for _ in collect_pushes(warm, library, executor):
                 pass
-            config = CollectPushes(Path(folder) / "pushes.h5", episodes=count, policy=policy, seed=1)
+            config = replace(warm, out=Path(folder) / "pushes.h5", episodes=count, seed=1)
             last = list(collect_pushes(config, library, executor))[-1]
         print(
-            f"collect pushes --policy {policy}, 2 workers: {last.episodes_per_s:.1f} episodes of 50 steps a second, "
-            f"{last.contact_share:.0%} of steps with contact, {last.motion_share:.0%} with motion"
+            f"{simulator}, collect pushes --policy {policy}, 2 workers: {last.episodes_per_s:.1f} episodes of 50 steps "
+            f"a second, {last.contact_share:.0%} of steps with contact, {last.motion_share:.0%} with motion"
         )
 
 
@@ -115,8 +118,9 @@ def main() -> None:
     library = AssetLibrary(arguments.data_dir / "objects")
     print(machine())
     observations(library, arguments.scenes)
-    physics(library)
-    episodes(library, arguments.episodes)
+    for simulator in get_args(Simulator):
+        physics(library, simulator)
+        episodes(library, arguments.episodes, simulator)
 
 
 if __name__ == "__main__":
