@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -224,29 +225,55 @@ def stop_on_key(stop: Callable[[str], None], terminal: int = 0) -> Iterator[bool
     if not os.isatty(terminal):
         yield False
         return
+    ended = threading.Event()
+    listener = threading.Thread(target=_listen, args=(stop, terminal, ended), name="stop key", daemon=True)
+    with _keys_at_once(terminal):
+        listener.start()
+        try:
+            yield True
+        finally:
+            ended.set()
+            listener.join()
+
+
+@contextlib.contextmanager
+def _keys_at_once(terminal: int) -> Iterator[None]:
+    """Let keys come at once and unseen; Ctrl-C still interrupts."""
+    if sys.platform == "win32":  # they do, for whoever reads them by msvcrt
+        yield
+        return
     import termios
     import tty
 
-    ended = threading.Event()
     before = termios.tcgetattr(terminal)
-    listener = threading.Thread(target=_listen, args=(stop, terminal, ended), name="stop key", daemon=True)
     try:
-        tty.setcbreak(terminal)  # keys come at once and unseen; Ctrl-C still interrupts
-        listener.start()
-        yield True
+        tty.setcbreak(terminal)
+        yield
     finally:
-        ended.set()
-        listener.join()
         termios.tcsetattr(terminal, termios.TCSADRAIN, before)
 
 
 def _listen(stop: Callable[[str], None], terminal: int, ended: threading.Event) -> None:
     while not ended.is_set():
-        if select.select([terminal], [], [], _LISTENS_EVERY_S)[0]:
-            with contextlib.suppress(OSError):  # a terminal that was closed is a reason, too
-                os.read(terminal, 1)
+        if _was_pressed(terminal):
             stop("a key was pressed")
             return
+
+
+def _was_pressed(terminal: int) -> bool:
+    """Wait a moment for a key, and take it."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        time.sleep(_LISTENS_EVERY_S)
+        if is_there := msvcrt.kbhit():
+            msvcrt.getch()
+        return is_there
+    is_there = bool(select.select([terminal], [], [], _LISTENS_EVERY_S)[0])
+    if is_there:
+        with contextlib.suppress(OSError):  # a terminal that was closed is a reason, too
+            os.read(terminal, 1)
+    return is_there
 
 
 RobotCommand = choice_of(check=RobotCheck, drive=RobotDriveCommand)

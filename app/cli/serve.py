@@ -6,7 +6,6 @@ import errno
 import ipaddress
 import logging
 import os
-import resource
 import secrets
 import signal
 import socket
@@ -18,6 +17,7 @@ from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import psutil
 import tyro
 
 from osfcore.errors import InvalidInput, OsfError
@@ -86,7 +86,8 @@ class Serve(DataCommand):
             # The server has a handler of its own, and raises the signal again once everything has stopped.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             # A terminal that closes asks for the same as `kill`.
-            signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
+            if sys.platform != "win32":
+                signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
             server.run(sockets=[listener])
         return {"url": url}
 
@@ -97,9 +98,10 @@ def check_memory() -> None:
     Raises:
         LittleMemory: if each process, or all of them together, may have less memory than they need.
     """
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit != resource.RLIM_INFINITY and limit < _ADDRESSES_GB * 1e9:
-        raise LittleMemory(f"ulimit -v lets each process have {limit / 1e9:.1f} GB", _ADDRESSES_GB)
+    if sys.platform == "linux":
+        limit, _ = psutil.Process().rlimit(psutil.RLIMIT_AS)
+        if limit != psutil.RLIM_INFINITY and limit < _ADDRESSES_GB * 1e9:
+            raise LittleMemory(f"ulimit -v lets each process have {limit / 1e9:.1f} GB", _ADDRESSES_GB)
     for path in _MEMORY_LIMITS:
         with suppress(OSError, ValueError):  # no such file, or "max"
             if (limit := int(path.read_text())) < _MEMORY_GB * 1e9:
@@ -120,7 +122,8 @@ def bound_socket(host: str, port: int) -> socket.socket:
     except OSError:
         raise CannotListen(f"The host {host!r} is not an address of this machine.") from None
     listener = socket.socket(family, kind, protocol)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if sys.platform != "win32":  # where it would take the port from whoever has it
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind(address)
         listener.listen(_BACKLOG)

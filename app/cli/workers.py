@@ -6,6 +6,7 @@ import asyncio
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -14,6 +15,8 @@ from multiprocessing.connection import wait
 from multiprocessing.context import SpawnContext, SpawnProcess
 
 from osfcore.errors import InvalidInput, OsfError, WorkerDied
+
+from ..processes.child_process import interrupts_held_back
 
 MAX_WORKERS = 256
 
@@ -85,11 +88,8 @@ class _Worker(SpawnProcess):
     """A worker that begins with Ctrl-C held back: until `_end_with_parent` has run, its answer would be a traceback."""
 
     def start(self) -> None:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        with interrupts_held_back():
             super().start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class _Workers(SpawnContext):
@@ -99,7 +99,8 @@ class _Workers(SpawnContext):
 def _end_with_parent() -> None:
     """Let Ctrl-C or the parent's death end a worker at once and silently: what it writes is whole or not there."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=_leave_after, args=(parent.sentinel,), daemon=True).start()

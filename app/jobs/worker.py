@@ -10,7 +10,7 @@ from typing import Any
 
 from osfcore.errors import OsfError
 
-from ..processes.child_process import end_own_group, import_quietly, own_group
+from ..processes.child_process import end_with_children, import_quietly
 from ..processes.server import ProcessServer
 from .context import JobCancelled, JobContext, JobControl, JobRests, JobStep, RunJob
 from .kinds import KINDS
@@ -31,7 +31,6 @@ def _prepare() -> None:
 
 def job_main(server: ProcessServer, is_in_reserve: bool = False) -> None:
     """Do the job that is asked for; a process in reserve loads code until then."""
-    own_group()
     control, must_prepare = JobControl(server.send), is_in_reserve
 
     def prepare(is_asked: bool) -> None:
@@ -42,7 +41,10 @@ def job_main(server: ProcessServer, is_in_reserve: bool = False) -> None:
 
     # A service that died leaves nobody who wants the result, and what is half-written counts as never begun.
     server.serve(
-        lambda job, _: run_job(job, control, server.send), idle=prepare, on_message=control.take, on_lost=end_own_group
+        lambda job, _: run_job(job, control, server.send),
+        idle=prepare,
+        on_message=control.take,
+        on_lost=end_with_children,
     )
 
 

@@ -6,15 +6,18 @@ import contextlib
 import importlib
 import multiprocessing
 import os
-import resource
 import signal
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from pathlib import Path
+from typing import cast
 
+import psutil
+
+_NICENESS = 5
 _SPAWN = multiprocessing.get_context("spawn")
 _NOTING_TRIES, _NOTING_S = 200, 0.005
 
@@ -23,18 +26,49 @@ def launch(target: Callable[..., None], name: str, *arguments: object) -> tuple[
     """Start `target(connection, *arguments)` in a new process; returns it and the other end of its pipe."""
     ours, theirs = _SPAWN.Pipe(duplex=True)
     process = _SPAWN.Process(target=target, name=name, args=(theirs, *arguments), daemon=True)
-    resource_tracker.ensure_running()  # its own start would unblock the signal again
-    # A Ctrl-C goes to the whole terminal group; children inherit the mask and thus never see one.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    if sys.platform != "win32":
+        resource_tracker.ensure_running()  # its own start would unblock the signal again
     try:
-        process.start()
+        with interrupts_held_back():  # children never see one
+            process.start()
     except BaseException:
         ours.close()
         raise
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()  # or its end would never be seen
-    return process, ours
+    return process, cast(Connection, ours)  # on Windows, it is another class with the same methods
+
+
+@contextlib.contextmanager
+def interrupts_held_back() -> Iterator[None]:
+    """Hold back Ctrl-C, which reaches everything that runs in a terminal, from this thread and what it starts.
+
+    Windows has no such thing: a process that starts there can be interrupted until it ignores the signal.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def leave_it_to_the_service() -> None:
+    """Ignore Ctrl-C, and a terminal that closes: the service decides when this process stops."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform != "win32":
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
+def give_way() -> None:
+    """Let other processes have the processor first."""
+    this = psutil.Process()
+    if sys.platform == "win32":
+        this.nice(psutil.BELOW_NORMAL_PRIORITY_CLASS)
+    else:
+        this.nice(this.nice() + _NICENESS)
 
 
 def silence_stdout() -> None:
@@ -57,45 +91,74 @@ def import_quietly(module: str) -> None:
 
 
 def limit_memory(more_bytes: int) -> None:
-    """Let this process take no more memory than this beside what it has now; asking for more is a MemoryError."""
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    most, hard = pages * resource.getpagesize() + more_bytes, resource.getrlimit(resource.RLIMIT_AS)[1]
-    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    """Let this process take no more memory than this beside what it has now; asking for more is a MemoryError.
+
+    Only Linux holds a process to it; elsewhere there is no limit.
+    """
+    if sys.platform == "linux":
+        most, _ = _limits(psutil.RLIMIT_AS, psutil.Process().memory_info().vms + more_bytes)
+        psutil.Process().rlimit(psutil.RLIMIT_AS, (most, most))
 
 
-def own_group() -> None:
-    """Make this process the head of a group, so that its own children end with it (see `end`)."""
-    os.setpgid(0, 0)
+def limit_cpu(more_s: int) -> None:
+    """End this process once it has computed for so long from now on [s]; only on Linux, as `limit_memory`."""
+    if sys.platform == "linux":
+        used = psutil.Process().cpu_times()
+        limits = _limits(psutil.RLIMIT_CPU, int(used.user + used.system) + more_s)
+        psutil.Process().rlimit(psutil.RLIMIT_CPU, limits)
 
 
-def end_own_group() -> None:
-    """End this process and its children at once; only for a process that called `own_group`."""
-    if os.getpgid(0) == os.getpid():
-        os.killpg(0, signal.SIGKILL)
+if sys.platform == "linux":
+
+    def _limits(which: int, most: int) -> tuple[int, int]:
+        """A limit, lowered to what the system lets this process have; and that."""
+        hard = psutil.Process().rlimit(which)[1]
+        return most if hard == psutil.RLIM_INFINITY else min(most, hard), hard
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether the system has stopped a process; False where that is not known."""
+    try:
+        return psutil.Process(pid).status() == psutil.STATUS_STOPPED
+    except psutil.Error:
+        return False
+
+
+def end_with_children() -> None:
+    """End this process and what it has started at once."""
+    _kill_started_by(os.getpid())
     os._exit(1)
 
 
 def end_children() -> None:
-    """End all children of this process and their groups at once, without waiting for them; for signal handlers."""
+    """End all children of this process and theirs at once, without waiting for them; for signal handlers."""
     for process in multiprocessing.active_children():
         if process.pid is not None:
-            with contextlib.suppress(ProcessLookupError):
-                if os.getpgid(process.pid) == process.pid:
-                    os.killpg(process.pid, signal.SIGKILL)
-                os.kill(process.pid, signal.SIGKILL)
+            _kill_tree(process.pid)
 
 
 def end(process: SpawnProcess, grace_s: float = 0.0) -> None:
-    """Wait `grace_s` for a process to leave by itself, then end it and its group. Calling it again does nothing."""
+    """Wait `grace_s` for a process to leave by itself, then end it and its children. Calling it again does nothing."""
     process.join(grace_s)
     if process.is_alive() and process.pid is not None:
-        with contextlib.suppress(ProcessLookupError):  # it has just left
-            if os.getpgid(process.pid) == process.pid:
-                os.killpg(process.pid, signal.SIGKILL)
+        _kill_tree(process.pid)
         process.kill()
     process.join()
     for _ in range(_NOTING_TRIES):  # another thread may have taken the exit code, and be about to note it
         if not process.is_alive():
             return
         time.sleep(_NOTING_S)
+
+
+def _kill_tree(pid: int) -> None:
+    with contextlib.suppress(psutil.Error):  # it has just left
+        head = psutil.Process(pid)
+        head.suspend()  # so that it starts nothing more
+        _kill_started_by(pid)
+        head.kill()
+
+
+def _kill_started_by(pid: int) -> None:
+    for process in psutil.Process(pid).children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            process.kill()

@@ -16,12 +16,11 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from pathlib import Path
 from typing import Any, Literal
 
 from osfcore.errors import OsfError
 
-from .child_process import end, launch
+from .child_process import end, is_stopped, launch
 from .server import Alive, Answer, Logged, Overtaken, Ready, Request, child_main
 
 Status = Literal["starting", "ready", "restarting"]
@@ -353,7 +352,6 @@ class Outbox:
 LOOK_S = 0.25  # between two looks
 STOPPED_S = 1.0  # a process that the system has stopped may be silent
 SILENT_S = 30.0  # any other: compiling and loading on a busy machine keep even a thread of its own from speaking
-_STOPPED = "T"
 
 
 class Watchdog:
@@ -396,16 +394,7 @@ class Watchdog:
             # Waiting behind others is no sign of hanging, so an answer to anybody counts.
             self._waited_s = self._waited_s + LOOK_S if self._is_asked() and not self._has_answered else 0.0
             self._has_spoken = self._has_answered = False
-            is_frozen = self._silent_s >= SILENT_S or (self._silent_s >= STOPPED_S and _is_stopped(self._pid))
+            is_frozen = self._silent_s >= SILENT_S or (self._silent_s >= STOPPED_S and is_stopped(self._pid))
             if is_frozen or self._waited_s > self._answer_s():
                 self._bark(is_frozen)
                 return
-
-
-def _is_stopped(pid: int) -> bool:
-    """Whether the system has stopped a process; False where that is not known."""
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="latin-1")
-    except OSError:
-        return False
-    return stat.rpartition(")")[2].split()[0] == _STOPPED

@@ -5,7 +5,6 @@ Only `renderer_main` is imported by the web process, by name; compiled code load
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -23,6 +22,7 @@ from osfcore.geometry.states import Observation, SceneState
 from osfcore.io.image_file import encode_png, to_uint8
 from osfcore.render.types import EXACT, PLANNING, Quality, SceneBatch
 
+from .child_process import give_way
 from .messages.neural_messages import CheckPhoto, CompareView, Comparison, DrawnView, DrawPhoto, DrawView, Order
 from .render_cameras import bands
 from .server import IsOvertaken, ProcessServer
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from osfcore.render.renderer import SceneRenderer
 
 DIFFERENCE_GAIN = 4  # as in the pictures that a training shows
-_NICENESS = 5  # the simulation, and what serves the page, come first
 _MOST_RENDERERS = 4
 # Cameras blend what falls into one pixel, so a fair comparison does so too.
 _COMPARED = replace(EXACT, samples_per_side=2)
@@ -41,7 +40,7 @@ _COMPARED = replace(EXACT, samples_per_side=2)
 
 def renderer_main(server: ProcessServer, data_dir: Path) -> None:
     """Carry out orders until the service has gone."""
-    os.nice(_NICENESS)
+    give_way()  # to the simulation, and to what serves the page
     server.serve(NeuralRenderer(FieldLibrary(data_dir)).render)
 
 

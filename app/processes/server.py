@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import signal
 import threading
 import time
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from typing import Any
 
 from osfcore.errors import OsfError
 
-from .child_process import silence_stdout
+from .child_process import leave_it_to_the_service, silence_stdout
 
 IsOvertaken = Callable[[], bool]
 ALIVE_S = 0.5
@@ -175,7 +174,7 @@ def child_main(connection: Connection, target: Callable[..., None], who: str, *a
         who: what people call this process.
         *arguments: of the target.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service decides when to stop
+    leave_it_to_the_service()
     silence_stdout()
     server = ProcessServer(connection, who)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[PipeHandler(server)])

@@ -17,7 +17,7 @@ from starlette.concurrency import run_in_threadpool
 from osfcore.errors import CannotWrite, CorruptFile, OsfError
 from osfcore.io.archives import check_zip
 
-from ..processes.child_process import limit_memory, own_group
+from ..processes.child_process import limit_memory
 from ..processes.client import ProcessClient, ProcessHangs, ProcessUnavailable
 from ..processes.server import ProcessServer
 from .database import storing
@@ -134,6 +134,5 @@ class Examiner(Generic[Found]):
 
 def examiner_main(server: ProcessServer, look: Callable[[Path], object]) -> None:
     """Look at the folder that is asked for."""
-    own_group()
     limit_memory(_MEMORY_BYTES)
     server.serve(lambda folder, _: look(folder))

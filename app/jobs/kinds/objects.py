@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import resource
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from osfcore.errors import InvalidInput, OsfError
 from osfcore.objects.fetch import NewObject, make_asset
 from osfcore.progress import Progress
 
-from ...processes.child_process import limit_memory
+from ...processes.child_process import limit_cpu, limit_memory
 from ..job import INPUTS
 from ..kind import JobKind
 from ..params import JobParams
@@ -64,7 +64,8 @@ def add_object_job(params: AddObjectParams, place: JobContext) -> Iterator[Addin
         MeshRefused: if it cannot be used.
         OsfError: if the disk refuses.
     """
-    _bound()
+    limit_memory(_MEMORY_BYTES)
+    limit_cpu(_CPU_S)
     inputs = place.folder / INPUTS
     new = params.object
     try:
@@ -72,7 +73,7 @@ def add_object_job(params: AddObjectParams, place: JobContext) -> Iterator[Addin
     except MemoryError:
         raise MeshRefused("The mesh needs too much memory; simplify it, or make its texture smaller.") from None
     except OsfError as error:
-        raise MeshRefused(_plain(error, new, str(inputs))) from error
+        raise MeshRefused(_plain(error, new, inputs)) from error
     finally:
         shutil.rmtree(inputs, ignore_errors=True)
 
@@ -98,15 +99,7 @@ def _added(new: NewObject, file_name: str, place: JobContext) -> Iterator[Adding
     yield AddingStep(_STEPS, _STEPS, "Ready", *measured)
 
 
-def _bound() -> None:
-    limit_memory(_MEMORY_BYTES)
-    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    most = int(used.ru_utime + used.ru_stime) + _CPU_S
-    resource.setrlimit(resource.RLIMIT_CPU, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
-
-
-def _plain(error: OsfError, new: NewObject, inputs: str) -> str:
+def _plain(error: OsfError, new: NewObject, inputs: Path) -> str:
     """The error in words that the uploader knows."""
     from osfcore.objects.mesh import WrongMeshSize
 
@@ -115,7 +108,7 @@ def _plain(error: OsfError, new: NewObject, inputs: str) -> str:
         fitting = [unit for metres, unit in _UNITS if _LIKELY_M[0] <= raw * metres <= _LIKELY_M[1]]
         advice = f"choose the unit {fitting[0]}" if fitting else "choose another unit or scale"
         return f"The mesh is {_length(error.longest_m)} long, but it must be between 5 mm and 1 m; {advice}."
-    text = str(error).replace(f"{inputs}/{UPLOAD}", "the uploaded file")
+    text = str(error).replace(str(inputs / UPLOAD), "the uploaded file")
     return text[:1].upper() + text[1:] if text.startswith("the ") else text
 
 

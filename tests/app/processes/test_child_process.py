@@ -6,12 +6,11 @@ import time
 
 import pytest
 
-from app.processes.child_process import end, import_quietly, launch, limit_memory, own_group, silence_stdout
+from app.processes.child_process import end, import_quietly, launch, limit_memory, silence_stdout
 from tests.app.conftest import until
 
 
 def echo(connection, greeting):
-    own_group()
     silence_stdout()
     os.write(1, b"nobody reads this")
     connection.send((greeting, os.getpid(), signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())))
@@ -19,7 +18,6 @@ def echo(connection, greeting):
 
 
 def with_child(connection):
-    own_group()
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     connection.send(child.pid)
     time.sleep(600)
