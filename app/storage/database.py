@@ -12,7 +12,6 @@ is renamed and an empty one takes its place: a service that does not start helps
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import logging
 import sqlite3
@@ -23,8 +22,9 @@ from dataclasses import astuple, dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import IO, Annotated, Any
+from typing import Annotated, Any
 
+from filelock import FileLock, Timeout
 from pydantic import Field, FiniteFloat
 
 from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, shown
@@ -145,9 +145,13 @@ def check_data_dir(data_dir: Path) -> None:
     Raises:
         DataDirectoryInUse, CorruptFile, CannotStore: as `Store`.
     """
-    with _claim(data_dir), contextlib.suppress(UnusableDatabase):
+    claimed = _claim(data_dir)
+    try:
         if (data_dir / FILE).exists():
-            open_database(data_dir / FILE).close()
+            with contextlib.suppress(UnusableDatabase):
+                open_database(data_dir / FILE).close()
+    finally:
+        claimed.release()
 
 
 class Store:
@@ -169,13 +173,13 @@ class Store:
         self._lock = threading.Lock()
         self._waiting: dict[str, tuple[Statement, ...]] = {}  # what the disk refused, oldest first
         self._set_aside: list[SetAside] = []
-        self._lock_file = _claim(data_dir)
+        self._claimed = _claim(data_dir)
         try:
             self._database = self._open()
             self._files = identities(self._path, self._path.with_name(f"{FILE}-wal"))
             self._left_as, self._checked_at = stamp(self._path), time.monotonic()
         except BaseException:
-            self._lock_file.close()
+            self._claimed.release()
             raise
 
     def close(self) -> None:
@@ -184,7 +188,7 @@ class Store:
         with self._lock:
             self._waiting.clear()
             self._database.close()
-            self._lock_file.close()
+            self._claimed.release()
 
     @property
     def set_aside(self) -> tuple[SetAside, ...]:
@@ -435,17 +439,16 @@ def stamp(path: Path) -> tuple[int, int, int] | None:
     return state.st_ino, state.st_size, state.st_mtime_ns
 
 
-def _claim(data_dir: Path) -> IO[str]:
-    """The lock file of a data directory, held until it is closed."""
+def _claim(data_dir: Path) -> FileLock:
+    """The lock of a data directory, held until it is released or this process ends."""
+    lock = FileLock(data_dir / "service.lock", blocking=False, thread_local=False)
     with storing(data_dir):
         data_dir.mkdir(parents=True, exist_ok=True)
-        file = (data_dir / "service.lock").open("w")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        file.close()
-        raise DataDirectoryInUse(data_dir) from error
-    return file
+        try:
+            lock.acquire()
+        except Timeout as error:
+            raise DataDirectoryInUse(data_dir) from error
+    return lock
 
 
 def _note(entry: SetAside) -> Statement:

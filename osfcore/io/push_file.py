@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import glob
 import json
 import shutil
@@ -15,6 +14,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from filelock import FileLock, Timeout
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from osfcore.errors import CorruptFile, InvalidInput
@@ -97,21 +97,22 @@ class EpisodeFolder:
         self._out = out
         self._folder = out.with_name(out.name + ".partial")
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._lock = (self._folder / "lock").open("w")
+        self._lock = FileLock(self._folder / "lock", blocking=False, thread_local=False)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock.acquire()
+        except Timeout:
+            raise InvalidInput("output file", out, "one that no other collection is writing") from None
+        try:
             self._adopt(settings)
-        except BaseException as error:
-            self._lock.close()
-            if isinstance(error, BlockingIOError):
-                raise InvalidInput("output file", out, "one that no other collection is writing") from None
+        except BaseException:
+            self._lock.release()
             raise
 
     def __enter__(self) -> EpisodeFolder:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._lock.close()
+        self._lock.release()
 
     def _adopt(self, settings: Mapping[str, object]) -> None:
         """Clean up after a killed run, and check that it had the same settings."""
@@ -121,7 +122,7 @@ class EpisodeFolder:
         path = self._folder / "settings.json"
         if not path.exists():
             write_atomically(path, text.encode())
-        elif path.read_text() != text:
+        elif path.read_text(encoding="utf-8") != text:
             allowed = "continued with the same settings, or its folder removed"
             raise InvalidInput(f"the collection begun in {self._folder}", "made with other settings", allowed)
         self._settings = text
@@ -149,6 +150,7 @@ class EpisodeFolder:
             file.attrs["settings"] = self._settings
             for index in range(count):
                 _write_group(file.create_group(f"{index:07d}"), load_episode(self.path(index)))
+        self._lock.release()  # Windows removes no file that is open
         shutil.rmtree(self._folder)
 
 
