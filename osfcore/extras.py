@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from osfcore.errors import OsfError
 
 PACKAGES = {
-    "sim": ("mujoco", "embreex", "coacd", "imageio_ffmpeg"),
+    "sim": ("mujoco", "coacd", "imageio_ffmpeg"),
     "serve": ("fastapi", "fastapi_offline", "uvicorn", "viser", "websockets", "msgspec", "prometheus_client",
               "itsdangerous", "pydantic_settings", "mujoco"),
     "gym": ("gymnasium",),

@@ -51,7 +51,7 @@ ROOMS = (
 OWNERS = {  # who alone may import a package
     "pybullet": ("osfcore.world.bullet_physics",),
     "mujoco": ("osfcore.world.mujoco_physics",),
-    "embreex": ("osfcore.world.imaging",),
+    "embreex": ("osfcore.world.embree",),
     "httpx2": ("osfcore.contrib.client", "osfcore.contrib.robots.http_robot"),
     "cma": ("osfcore.estimation.search",),
     "coacd": ("osfcore.geometry.convex_parts",),

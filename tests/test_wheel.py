@@ -85,7 +85,7 @@ def test_examples_run_without_simulator_and_service(python, place, name, words):
     ("arguments", "words"),
     [
         (("serve",), "osf: This command needs fastapi, "),
-        (("episode", "--out", "pushed"), "osf: The simulated table needs mujoco, embreex, "),
+        (("episode", "--out", "pushed"), "osf: The simulated table needs mujoco, "),
     ],
 )
 def test_what_is_missing_is_told_in_one_sentence(python, place, arguments, words):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import KW_ONLY, dataclass, field
+from importlib.util import find_spec
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float, Int
 
 from osfcore.errors import InvalidInput
@@ -20,6 +20,11 @@ from osfcore.geometry.poses import Pose, quaternion_to_matrix
 from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
 from osfcore.objects.asset import TexturedMesh
+
+if TYPE_CHECKING or find_spec("embreex") is not None:
+    from osfcore.world.embree import Triangles
+else:  # as on Linux on ARM, for which there are no wheels of it
+    from osfcore.world.bounding_boxes import Triangles
 
 # Materials and lamp of the image model: Lambert shading without specular part,
 #
@@ -177,15 +182,12 @@ def highlight(
     return (lamp.intensity * lamp.specular * visible * np.maximum(cosine, 0) ** _SHININESS)[:, None]
 
 
-# Rays and one textured mesh: intersection and occlusion by Embree, prefiltered texture lookup.
+# Rays and one textured mesh: intersection and occlusion, prefiltered texture lookup.
 #
 # The ray structure is built once per object, in the object's own frame; scenes move rays, not meshes.
 
 
-NO_HIT = np.float32(1e30)
-
-
-class TracedMesh:
+class TracedMesh(Triangles):
     """A textured mesh that answers ray queries in its own frame.
 
     Args:
@@ -195,8 +197,7 @@ class TracedMesh:
     def __init__(self, mesh: TexturedMesh) -> None:
         vertices = np.ascontiguousarray(mesh.vertices, np.float32)
         faces = np.ascontiguousarray(mesh.faces, np.int32)
-        self._scene = EmbreeScene()
-        TriangleMesh(self._scene, vertices, faces)
+        super().__init__(vertices, faces)
         corners = vertices[faces]
         self._face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self._corner_normals = mesh.normals[faces].astype(np.float32)
@@ -205,22 +206,6 @@ class TracedMesh:
         self._texels_per_m = _texels_per_metre(mesh)
         self.bounds = np.stack([vertices.min(0), vertices.max(0)])
         self.radius_m = float(np.linalg.norm(vertices, axis=1).max())
-        self._scene.run(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))  # builds the structure now
-
-    def intersect(
-        self, origins: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "S 3"]
-    ) -> tuple[Float[np.ndarray, "S"], Int[np.ndarray, "S"], Float[np.ndarray, "S 2"]]:
-        """Find the first hit of each ray: distance [ray lengths] or NO_HIT, face index, barycentric coordinates."""
-        hits = self._scene.run(origins, directions, output=1)
-        missed = hits["primID"] < 0
-        distance = np.where(missed, NO_HIT, hits["tfar"])
-        return distance, hits["primID"], np.stack([hits["u"], hits["v"]], axis=-1)
-
-    def occludes(
-        self, origins: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "S 3"], end: float | None = None
-    ) -> Bool[np.ndarray, "S"]:
-        """Return whether the mesh stands in each ray's way, up to `end` [ray lengths] if it is given."""
-        return self._scene.run(origins, directions, end, query="OCCLUDED") >= 0
 
     def surface(
         self, faces: Int[np.ndarray, "S"], barycentric: Float[np.ndarray, "S 2"], directions: Float[np.ndarray, "S 3"]
@@ -754,7 +739,7 @@ def _shade(
 ) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"], np.ndarray]:
     """Compute radiance, depth and owner (index of the body, or -1) of the samples at pixel coordinates."""
     directions = shot.directions(points)
-    nearest = np.full(len(points), NO_HIT, np.float32)
+    nearest = np.full(len(points), np.inf, np.float32)
     owner = np.full(len(points), -1)
     face = np.zeros(len(points), np.int64)
     barycentric = np.zeros((len(points), 2), np.float32)
@@ -786,7 +771,7 @@ def _shade(
 
 def _above_table(shot: Shot, directions: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, "S"]:
     """Return which hits lie above the table's plane: a body that sinks in a little does not shine through."""
-    z = shot.origin[2] + np.where(distance < NO_HIT, distance, 0) * directions[:, 2]
+    z = shot.origin[2] + np.where(np.isfinite(distance), distance, 0) * directions[:, 2]
     return z > -1e-4 if shot.origin[2] > 0 else np.ones(len(z), bool)
 
 

@@ -14,7 +14,6 @@ from osfcore.geometry.states import SceneState
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_CENTRE_Z_M, PUSHER_HEIGHT_M, PUSHER_RADIUS_M, TABLE_SIDE_M
 from osfcore.world.imaging import (
     BACKGROUND_RADIANCE,
-    NO_HIT,
     TABLE_ALBEDO,
     Lamp,
     Picture,
@@ -144,11 +143,11 @@ def test_intersections_and_occlusion_agree_with_the_slab_method():
     distance, faces, _ = BOX.intersect(origins, directions)
     half = np.array([HALF, HALF, HEIGHT / 2])
     enter, leave = slab_spans(half, origins.astype(float), directions.astype(float))
-    expected = np.where((enter <= leave) & (enter > 0), enter, NO_HIT)
-    graze = np.abs(expected - distance) > 1e-4
+    expected = np.where((enter <= leave) & (enter > 0), enter, np.inf)
+    graze = ~np.isclose(distance, expected, rtol=0, atol=1e-4)
     assert graze.mean() < 0.002
-    np.testing.assert_array_equal(BOX.occludes(origins, directions)[~graze], (expected < NO_HIT)[~graze])
-    assert np.all((faces >= 0) == (distance < NO_HIT))
+    np.testing.assert_array_equal(BOX.occludes(origins, directions)[~graze], (expected < np.inf)[~graze])
+    assert np.all((faces >= 0) == (distance < np.inf))
 
 
 def test_pusher_is_a_closed_cylinder_of_the_stated_size_and_colour():
