@@ -2,6 +2,7 @@
 # make test-all   every test, browser included      make coverage   lines that the quick tests reach
 # make docs   the site of documents, in build/docs
 # make test-pythons   that the library installs and runs on later Pythons, where there is no PyBullet
+# make check-wheels   that all packages are to be had for macOS, Windows and ARM
 # Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   OSF_DATA_DIR=<where objects and runs live>
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
@@ -14,8 +15,10 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 OFFLINE := echo "make: the packages could not be installed; see the lines above (is there a network connection?)" >&2
 
 LATER := 3.12 3.13
+# What is checked for other systems, too; the rest asks nothing of the system, and all of it would take minutes.
+ASKS_THE_SYSTEM := app osfcore/io
 
-.PHONY: demo install dev test test-all test-pythons coverage lint docs soak bench clean
+.PHONY: demo install dev test test-all test-pythons check-wheels coverage lint docs soak bench clean
 
 demo: install
 	@$(BIN)/osf assets fetch
@@ -60,6 +63,11 @@ test-pythons: dev $(LATER:%=.cache/python%/.installed)
 	.cache/python$*/bin/pip uninstall -q -y osf-manipulation
 	@touch $@
 
+# Whether all that is needed is to be had as wheels for each system and Python; asks PyPI for minutes.
+check-wheels: dev
+	$(PIP) install -q uv
+	PATH=$(BIN):$$PATH $(BIN)/python .ci/check_wheels.py
+
 coverage: dev
 	$(BIN)/pytest -n 2 --dist loadfile --cov=osfcore --cov=app --cov-report=term:skip-covered
 
@@ -67,6 +75,8 @@ lint: dev
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+	$(BIN)/pyright --pythonplatform Darwin $(ASKS_THE_SYSTEM)
+	$(BIN)/pyright --pythonplatform Windows $(ASKS_THE_SYSTEM)
 
 # From the beginning each time: pages are made from code, which Sphinx does not watch.
 docs: dev
