@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import stat
+import sys
 from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -225,7 +226,8 @@ class OpenFile(FileResponse):
             self._file.close()
             raise NotFound(gone)
         super().__init__(
-            f"/dev/fd/{self._file.fileno()}",  # opened again, it is the same file, whatever has its name by then
+            # Opened again, it is the same file, whatever has its name by then; on Windows it keeps its name while open.
+            path if sys.platform == "win32" else f"/dev/fd/{self._file.fileno()}",
             headers=headers,
             media_type=media_type,
             filename=filename,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pathlib
 import shutil
+import sys
 import time
 from collections import Counter as Tally
 from collections.abc import Iterator
@@ -30,7 +31,7 @@ LEAST_FREE_BYTES = 50 << 20  # on the disk of the data directory; with less, the
 
 def _disk_problem(data_dir: pathlib.Path) -> str | None:
     try:
-        if os.statvfs(data_dir).f_flag & os.ST_RDONLY:
+        if sys.platform != "win32" and os.statvfs(data_dir).f_flag & os.ST_RDONLY:
             return "The disk of the data directory is read-only."
         free = shutil.disk_usage(data_dir).free
     except OSError as error:

@@ -188,7 +188,7 @@ class Predict(DataCommand):
         follow(show_prediction(request, renderer, None if lacking else assets))
         if lacking:
             return {"images": str(folder), "psnr": None, "lacking": lacking}
-        return {"images": str(folder), "psnr": json.loads((folder / PSNR_FILE).read_text())["psnr"]}
+        return {"images": str(folder), "psnr": json.loads((folder / PSNR_FILE).read_text(encoding="utf-8"))["psnr"]}
 
 
 def _prediction_text(result: dict[str, Any]) -> Iterator[str]:

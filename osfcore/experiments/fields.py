@@ -227,7 +227,7 @@ def field_figures(result: TaskResult, weights: Path) -> dict[str, Any]:
         weights: of the field; "minutes" are None where no metrics lie beside them.
     """
     try:
-        minutes = float(json.loads(weights.with_suffix(".json").read_text())["minutes"])
+        minutes = float(json.loads(weights.with_suffix(".json").read_text(encoding="utf-8"))["minutes"])
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         minutes = None
     return {**result.figures, "file_mb": weights.stat().st_size / 1e6, "minutes": minutes}

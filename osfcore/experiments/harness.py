@@ -177,7 +177,7 @@ class TaskCache:
             circumstances: plain JSON of everything the result depends on; a result with other ones is stale.
         """
         try:
-            content = json.loads((self.folder / f"{name}.json").read_text())
+            content = json.loads((self.folder / f"{name}.json").read_text(encoding="utf-8"))
             if content["circumstances"] != json.loads(json.dumps(circumstances)):
                 return None
             arrays = io.BytesIO((self.folder / f"{name}.npz").read_bytes())

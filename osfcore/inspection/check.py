@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -198,7 +199,7 @@ def _unpacked(path: Path) -> Iterator[Path]:
         except CorruptFile as error:
             if str(error).startswith(str(path)):
                 raise
-            inside = str(error).replace(f"{place}/", "").rstrip(".")
+            inside = str(error).replace(f"{place}{os.sep}", "").rstrip(".")
             raise CorruptFile(path, inside) from error
 
 

@@ -14,6 +14,7 @@ import os
 import secrets
 import shutil
 import struct
+import sys
 import tempfile
 import time
 import zlib
@@ -27,6 +28,7 @@ from osfcore.errors import CannotWrite, CorruptFile, InvalidInput, OsfError, sho
 
 MAX_JSON_BYTES = 16_000_000
 _PNG_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+_TRIES, _AGAIN_S = 100, 0.01
 T = TypeVar("T")
 
 
@@ -42,7 +44,7 @@ def writing(place: Path) -> Iterator[None]:
 def sync(path: Path) -> None:
     """Wait until a file's contents are on the disk, or a folder's list of names if the system supports that."""
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)  # as Windows wants it
     except PermissionError:
         if path.is_dir():  # it may be open for writing alone
             return
@@ -215,8 +217,23 @@ def _make_folder(folder: Path, wanted: Path) -> None:
 def _rename(made: Path, place: Path) -> None:
     """Rename a file or folder once its contents are on the disk; then sync the name."""
     sync_tree(made)
-    made.replace(place)
+    if sys.platform == "win32":
+        _replace_on_windows(made, place)
+    else:
+        made.replace(place)
     sync(place.parent)
+
+
+def _replace_on_windows(made: Path, place: Path) -> None:
+    """Rename where an empty folder is in the way, and files cannot be replaced while another process reads them."""
+    if made.is_dir() and place.is_dir():
+        place.rmdir()
+    for _ in range(_TRIES):
+        with contextlib.suppress(PermissionError):
+            made.replace(place)
+            return
+        time.sleep(_AGAIN_S)
+    made.replace(place)
 
 
 def _beside(path: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 from collections.abc import Collection
 from pathlib import Path
@@ -48,11 +49,15 @@ def check_place(path: Path) -> None:
             while not ground.exists() and ground != ground.parent:
                 ground = ground.parent
             longest = max((len(os.fsencode(part)) for part in path.parts), default=0)
-            if longest + _MARGIN_BYTES > os.pathconf(ground, "PC_NAME_MAX"):
+            if longest + _MARGIN_BYTES > _longest_name(ground):
                 raise CannotWrite(path, "its name is too long")
             tempfile.TemporaryFile(prefix=".trial-", dir=ground).close()
     except UnicodeEncodeError as error:
         raise CannotWrite(path, "its name cannot be written") from error
+
+
+def _longest_name(folder: Path) -> int:
+    return 255 if sys.platform == "win32" else os.pathconf(folder, "PC_NAME_MAX")
 
 
 def _has_keys(path: Path, keys: Collection[str]) -> bool:

@@ -169,7 +169,7 @@ def pip_download(requirement: str, folder: Path) -> Iterator[int]:
             process.terminate()
             process.wait()
     if process.returncode:
-        raise FetchFailed(requirement, _pip_reason(log_path.read_text(errors="replace")))
+        raise FetchFailed(requirement, _pip_reason(log_path.read_text(encoding="utf-8", errors="replace")))
 
 
 def _pip_reason(log: str) -> str:

@@ -118,7 +118,7 @@ class BulletPhysics(Physics):
         """Add one object, out of everything's way until it is placed; return its Bullet id."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "parts.obj"  # Bullet makes a compound of hulls from the groups of an OBJ file
-            path.write_text(_hulls_as_obj(model.hulls))
+            path.write_text(_hulls_as_obj(model.hulls), encoding="utf-8")
             shape = self._bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path))
         # A visual shape of its own keeps Bullet from reading the file again for one.
         visual = self._bullet.createVisualShape(pybullet.GEOM_SPHERE, radius=0.001)

@@ -156,7 +156,7 @@ def _write_set(config: CollectObject | CollectTable, shoot: Shoot, what: str) ->
                 annotations.append(_save(folder / f"{number:04d}.png", camera, light, rgba))
                 done += 1
                 yield Progress(done, images, f"Image {done} of {images} of {what}")
-            (folder / "anno.json").write_text(json.dumps(annotations))
+            (folder / "anno.json").write_text(json.dumps(annotations), encoding="utf-8")
 
 
 def _save(path: Path, camera: Camera, light: np.ndarray, rgba: Float[np.ndarray, "h w 4"]) -> dict[str, object]:

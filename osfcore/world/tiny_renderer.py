@@ -91,8 +91,8 @@ class TinyScene:
         """Add a visual body; Bullet takes textured meshes from OBJ files only, read while the files exist."""
         with tempfile.TemporaryDirectory() as folder:
             cv2.imwrite(f"{folder}/texture.png", mesh.texture[..., ::-1])
-            Path(folder, "mesh.mtl").write_text("newmtl material\nmap_Kd texture.png\n")
-            Path(folder, "mesh.obj").write_text(_as_obj(mesh))
+            Path(folder, "mesh.mtl").write_text("newmtl material\nmap_Kd texture.png\n", encoding="utf-8")
+            Path(folder, "mesh.obj").write_text(_as_obj(mesh), encoding="utf-8")
             shape = self._bullet.createVisualShape(pybullet.GEOM_MESH, fileName=f"{folder}/mesh.obj")
             return self._bullet.createMultiBody(0, -1, shape, [0, 0, -100])
 

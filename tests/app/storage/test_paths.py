@@ -27,6 +27,7 @@ def test_tilde_is_home(monkeypatch):
     [
         ("{}/goals/x.png cannot be used.", "goals/x.png cannot be used."),
         ("'{}/a b' and {}/c", "'a b' and c"),
+        (r"{}\goals\x.png and '{}\\goals'", r"goals\x.png and 'goals'"),
         ("{} cannot be written.", "The data directory cannot be written."),
         ("Nothing fits into {}.", "Nothing fits into the data directory."),
         ("It is {}2/x, not /mnt{}/x.", "It is {}2/x, not /mnt{}/x."),
