@@ -23,8 +23,7 @@ RUN pip install -c requirements.lock '.[serve]'
 
 RUN useradd --create-home --uid 1000 osf && install -d -o osf /data
 USER osf
-# Compiled renderers are kept in the volume: the package's own folder belongs to root.
-ENV OSF_DATA_DIR=/data NUMBA_CACHE_DIR=/data/compiled
+ENV OSF_DATA_DIR=/data
 VOLUME /data
 EXPOSE 8000
 HEALTHCHECK --start-period=120s --interval=30s --timeout=5s \

@@ -16,7 +16,9 @@ from osfcore.objects.asset_library import AssetLibrary
 from osfcore.objects.fetch import FolderSource, WheelSource, fetch
 from tests.kernels import compile_kernels
 
+CACHE = Path(__file__).parents[1] / ".cache"
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # as the command line does, before torch comes in
+os.environ.setdefault("NUMBA_CACHE_DIR", str(CACHE / "compiled"))  # tests have data directories of their own
 os.environ.setdefault("OSF_STANDBY", "0")  # a process in reserve would take time from tests that need none
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # each process has its share of the cores: more threads would only wait
     _THREADS = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
@@ -28,7 +30,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
-CACHE = Path(__file__).parents[1] / ".cache"
 TEST_OBJECTS = ("003_cracker_box", "005_tomato_soup_can", "006_mustard_bottle", "009_gelatin_box", "035_power_drill")
 
 

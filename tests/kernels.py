@@ -1,6 +1,6 @@
 """Compile the kernels before tests begin, so that no test waits for it: on a fresh clone it takes a minute.
 
-Numba keeps what it has compiled beside the source. Processes that share the tests begin with different kernels.
+What is compiled is kept in .cache. Processes that share the tests begin with different kernels.
 """
 
 from pathlib import Path

@@ -96,6 +96,39 @@ def test_what_is_missing_is_told_in_one_sentence(python, place, arguments, words
     assert "pip install 'osf-manipulation[" in sentence
 
 
+@pytest.fixture
+def locked(python, tmp_path):
+    """What runs a command as a user to whom the installed package and the home belong, but who cannot write there."""
+    unprivileged = ()
+    if os.geteuid() == 0:  # who writes everywhere
+        if shutil.which("setpriv") is None:
+            pytest.skip("root without setpriv")
+        unprivileged = ("setpriv", "--bounding-set=-dac_override", "--inh-caps=-all")
+    (site,) = python.parents[1].glob("lib/*/site-packages")
+    folders = [tmp_path / "locked", *(place for part in ("osfcore", "osf_app") for place in (site / part).rglob("*/"))]
+    folders[0].mkdir()
+    folders += [site / "osfcore", site / "osf_app"]
+    modes = [(folder, folder.stat().st_mode) for folder in folders]
+    for folder in folders:
+        folder.chmod(0o555)
+
+    def run_locked(*arguments, **environment):
+        lacking = {"HOME": str(folders[0] / "home"), "XDG_DATA_HOME": "", "NUMBA_CACHE_DIR": "", **environment}
+        return run(*unprivileged, python.with_name("osf"), *arguments, cwd=tmp_path, **lacking)
+
+    yield run_locked
+    for folder, mode in modes:
+        folder.chmod(mode)
+
+
+def test_who_cannot_write_beside_the_package_keeps_kernels_in_the_data_directory(locked, pushed, tmp_path):
+    drawn = ("render", "--scene", pushed[0], "--camera", "0", "--out", tmp_path / "seen.png")
+    assert locked(*drawn, "--data-dir", tmp_path / "data").stderr == ""
+    assert list((tmp_path / "data").rglob("*.nbi"))
+    (sentence,) = locked(*drawn).stderr.splitlines()
+    assert str(tmp_path / "locked") in sentence
+
+
 @pytest.fixture(scope="module", params=["3.12", "3.13"])
 def later(request, place, built):
     """Python for which there is no PyBullet, with the wheel and all else that its extras bring."""

@@ -68,6 +68,9 @@ def _run(arguments: list[str]) -> int:
         print(f"osf {version('osf-manipulation')}")
         return 0
     command = _parsed(arguments)
+    data_dir = getattr(command, "data_dir", None)
+    if data_dir is not None:  # compiled code is kept there, by child processes, too
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(data_dir.absolute() / "compiled"))
     result = command.run()
     if command.json:
         import json

@@ -47,12 +47,13 @@ from osfcore.dynamics.shapes import (
     ShapeTable,
 )
 from osfcore.geometry.workspace import PUSHER_RADIUS_M
+from osfcore.objects.kernel_cache import kept_kernel
 
 # How kernels and their helpers are compiled, and the numbers that all of them know.
 
 
 HELPER: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "_nrt": False}
-KERNEL: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
+KERNEL: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "nogil": True}
 ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 NEVER = np.float32(1e9)  # more than any distance
 
@@ -949,7 +950,7 @@ _SLEEP_M, _SLEEP_RAD = np.float32(SLEEP_M), np.float32(SLEEP_RAD)
 _STANDS, _AT_REST, _TINIEST = np.float32(1e-6), np.float32(1e-9), np.float32(1e-20)
 
 
-@numba.njit(**KERNEL)
+@kept_kernel(**KERNEL)
 def unroll_block(
     shapes, weights, number, start, begins, velocity, shifts, first, last, centre, quaternion, has_moved
 ) -> None:

@@ -32,6 +32,7 @@ from osfcore.fields.rays import (
 )
 from osfcore.geometry.poses import fibonacci_sphere
 from osfcore.io.image_set import ImageSet
+from osfcore.objects.kernel_cache import kept_kernel
 
 # ruff: noqa: ANN001, ANN202 - compiled functions; types are given by their callers
 
@@ -205,7 +206,7 @@ def _misfit(normal, lights, seen, towards, is_lit, shade):
     return total / np.float32(count)
 
 
-@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
+@kept_kernel(parallel=True, fastmath=True, error_model="numpy", nogil=True)
 def _judge(misfit, solid, opaque, points, to_pixels, eyes, lights, brightness, normals):
     """Fill in the least misfit of every point over all normals; -1 if too few views see the point."""
     views = len(eyes)
@@ -387,7 +388,7 @@ def _spread(rows, weights, features, gains, count, depth, light, slope, slope_al
                 out[rows[s, q], c] += weights[s, q] * own[c]
 
 
-@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
+@kept_kernel(parallel=True, fastmath=True, error_model="numpy", nogil=True)
 def _descend(parts, values, index, origins, directions, lights, rgb, alpha, offsets):
     for part in numba.prange(len(parts)):
         rows, weights = np.empty((_MOST_SAMPLES, 8), np.int32), np.empty((_MOST_SAMPLES, 8), np.float32)

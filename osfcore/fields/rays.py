@@ -28,6 +28,7 @@ from osfcore.fields.kiloosf import (
 )
 from osfcore.geometry.cameras import Camera
 from osfcore.io.image_set import ImageSet
+from osfcore.objects.kernel_cache import kept_kernel
 
 # Walking along a ray through one field's density; compiled for the CPU.
 #
@@ -123,7 +124,7 @@ def inverted(d):  # noqa: ANN001, ANN201
     return np.float32(1e9)
 
 
-@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True, nogil=True)
+@kept_kernel(parallel=True, fastmath=True, error_model="numpy", nogil=True)
 def _march(origins, directions, density, macro, low, voxel, step, offsets, min_weight, min_transmittance, ts, counts):  # noqa: ANN001, ANN202
     nx, ny, nz = density.shape
     my, mz = macro.shape[1], macro.shape[2]

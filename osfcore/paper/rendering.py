@@ -20,6 +20,7 @@ from osfcore.geometry.cameras import Camera
 from osfcore.geometry.light import AMBIENT, DIFFUSE
 from osfcore.geometry.poses import quaternion_to_matrix
 from osfcore.geometry.workspace import PUSHER_ALBEDO, PUSHER_HEIGHT_M, PUSHER_RADIUS_M
+from osfcore.objects.kernel_cache import kept_kernel
 from osfcore.paper.fields import (
     DIRECTION_INPUTS,
     DIRECTION_OCTAVES,
@@ -287,7 +288,7 @@ def shadow_maps(
     return ShadowMaps(surface, axes, centre, radius, bias, map_of.reshape(local.shape[:2]))
 
 
-@numba.njit(**KERNEL)
+@kept_kernel(**KERNEL)
 def render_surfaces(pack, which, axes, centre, radius, surface) -> None:
     """Fill the maps; arguments as in `ShadowMaps`, and the field of each map."""
     count, side = len(which), surface.shape[1]
@@ -567,7 +568,7 @@ def _trace(pack, fields, table, scene, maps, directs, cameras, boxes, rules, b, 
     _add_behind(table, scene, maps, directs, cameras, b, view, dx, dy, dz, table_t, pusher_t, is_cap, left, work)
 
 
-@numba.njit(**KERNEL)
+@kept_kernel(**KERNEL)
 def render_batch(pack, fields, table, scene, maps, directs, cameras, boxes, rules, samples, only, rgb, opacity,
                  distance) -> None:  # fmt: skip
     """Render every image of a batch.

@@ -29,6 +29,7 @@ from osfcore.geometry.poses import (
     quaternion_to_matrix,
     rotate,
 )
+from osfcore.objects.kernel_cache import kept_kernel
 from osfcore.photo.photograph import Photograph, WindowFrame, mask_box
 
 # Compiled comparison of an object's surfels in many poses with one photograph.
@@ -46,7 +47,7 @@ _REWEIGHTED = 2  # fits of the light
 _BOX_STD, _FARTHEST_STD = 0.04, 4.0  # of a side, per side of the box; beyond, a side counts no more
 _LIGHTS = 4  # ambient and first-order harmonics
 _NEAREST_M = np.float32(0.02)
-_OPTIONS = {"fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
+_OPTIONS = {"fastmath": True, "error_model": "numpy", "nogil": True}
 _SMALL, _LARGE = 1, 5  # half sides of the band-pass's windows [px]
 _CONTRAST_FLOOR = 0.02  # of the mean luminance: contrast below it counts as noise
 _AMBIENT_RIDGE, _HARMONIC_RIDGE = 1e-4, 2e-2  # of the ambient term's weight
@@ -66,7 +67,7 @@ def _close_gaps(nearest, index) -> None:
                 index[row, column], nearest[row, column] = index[row - 1, column], nearest[row - 1, column]
 
 
-@numba.njit(**_OPTIONS)
+@kept_kernel(**_OPTIONS)
 def draw_surfels(points, normals, half, r, t, lens, nearest, index) -> None:
     """Draw surfels by z-buffer.
 
@@ -204,7 +205,7 @@ def _correlation(fitted, luminance, compared, tables) -> float:
     return ab / np.sqrt((a2 + floor) * (b2 + floor) + 1e-12)
 
 
-@numba.njit(parallel=True, **_OPTIONS)
+@kept_kernel(parallel=True, **_OPTIONS)
 def compare_poses(
     points, normals, albedo, half, rotations, positions, lens, image, luminance, mask, known, usable, evidence, level,
     box, terms,
@@ -282,7 +283,7 @@ def compare_poses(
         terms[b, 2] = _correlation(fitted, luminance, compared, np.empty((3, height + 1, width + 1)))
 
 
-@numba.njit(parallel=True, **_OPTIONS)
+@kept_kernel(parallel=True, **_OPTIONS)
 def draw_poses(points, normals, half, rotations, positions, lens, nearest, index) -> None:
     """`draw_surfels` for B poses; nearest and index are B x h x w."""
     for b in numba.prange(len(positions)):

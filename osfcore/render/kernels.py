@@ -14,6 +14,7 @@ import numpy as np
 
 from osfcore.fields.kiloosf import FEATURES, MACRO_BITS, MOST_HIDDEN, NETWORK_INPUTS
 from osfcore.fields.rays import interpolate, inverted, leave_blocks, optical_density, within
+from osfcore.objects.kernel_cache import kept_kernel
 
 # How kernels and their helpers are compiled, and the numbers that all of them use.
 
@@ -24,7 +25,7 @@ _ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(n) for n in (0, 0.5, 1, 2, 3))
 _1, _2, _3, _4 = (np.uint64(n) for n in (1, 2, 3, 4))  # steps of indices
 GONE, STILL, MOVES = 0, 1, 2  # an object that is not there, or that is in the base, or in the scene alone
 HELPER: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
-KERNEL: dict[str, Any] = {"parallel": True, "fastmath": True, "error_model": "numpy", "cache": True, "nogil": True}
+KERNEL: dict[str, Any] = {"parallel": True, "fastmath": True, "error_model": "numpy", "nogil": True}
 
 
 # Layers of tiny networks, compiled for the CPU.
@@ -697,7 +698,7 @@ def _put(rgb, distance, b, view, row, column, red, green, blue, t) -> None:
         distance[b, view, row, column] = t
 
 
-@numba.njit(**KERNEL)
+@kept_kernel(**KERNEL)
 def render_batch(pack, table, fields, scene, lamps, cameras, base, rules, only, stride, rgb, opacity, distance) -> None:
     """Render every image of a batch.
 
