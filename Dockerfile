@@ -19,7 +19,7 @@ COPY .ci/editable.py .ci/
 COPY osfcore osfcore
 COPY app app
 COPY static static
-RUN pip install -c requirements.lock '.[serve]'
+RUN pip install -c requirements.lock '.[serve,heic,video]'
 
 RUN useradd --create-home --uid 1000 osf && install -d -o osf /data
 USER osf

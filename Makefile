@@ -35,7 +35,7 @@ $(BIN)/python:
 $(VENV)/.installed: $(BIN)/python pyproject.toml requirements.lock
 	@echo "Installing packages into $(VENV) (a few minutes the first time)"
 	@$(if $(TORCH_INDEX),$(PIP) install -q -c requirements.lock --index-url $(TORCH_INDEX) torch || { $(OFFLINE); exit 1; },:)
-	@$(PIP) install -q -c requirements.lock -e '.[serve]' || { $(OFFLINE); exit 1; }
+	@$(PIP) install -q -c requirements.lock -e '.[serve,heic,video]' || { $(OFFLINE); exit 1; }
 	@touch $@
 
 $(VENV)/.dev-installed: $(VENV)/.installed
@@ -59,7 +59,7 @@ test-pythons: dev $(LATER:%=.cache/python%/.installed)
 .cache/python%/.installed: pyproject.toml requirements.lock
 	python$* -m venv .cache/python$*
 	$(if $(TORCH_INDEX),.cache/python$*/bin/pip install -q -c requirements.lock --index-url $(TORCH_INDEX) torch,:)
-	.cache/python$*/bin/pip install -q -c requirements.lock '.[serve,gym,mcap,lerobot,ros,usd]'
+	.cache/python$*/bin/pip install -q -c requirements.lock '.[serve,heic,gym,mcap,lerobot,ros,usd]'
 	.cache/python$*/bin/pip uninstall -q -y osf-manipulation
 	@touch $@
 

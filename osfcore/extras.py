@@ -8,12 +8,14 @@ from importlib.util import find_spec
 from osfcore.errors import OsfError
 
 PACKAGES = {
-    "sim": ("mujoco", "coacd", "imageio_ffmpeg"),
+    "sim": ("mujoco", "coacd"),
     "serve": ("fastapi", "fastapi_offline", "uvicorn", "viser", "websockets", "msgspec", "prometheus_client",
               "itsdangerous", "pydantic_settings", "mujoco"),
     "gym": ("gymnasium",),
     "mcap": ("foxglove",),
-    "lerobot": ("pyarrow", "imageio_ffmpeg"),
+    "heic": ("pillow_heif",),
+    "video": ("imageio_ffmpeg",),
+    "lerobot": ("pyarrow",),
     "ros": ("websockets",),
     "usd": ("pxr",),
     "experiments": ("matplotlib", "jinja2"),

@@ -68,6 +68,13 @@ class DataCommand(Command):
 
         return AssetLibrary(self.data_dir / "objects")
 
+    def say_if_no_video(self) -> None:
+        """Say how to get videos, where there is nothing that encodes them."""
+        from osfcore.io.video_file import ffmpeg_or_none
+
+        if ffmpeg_or_none() is None:
+            self.say("There is no video: ffmpeg is missing; get it with: pip install 'osf-manipulation[video]'")
+
     @property
     def trained(self) -> FieldLibrary:
         """The fields that were trained on this machine, and those that come with the program."""

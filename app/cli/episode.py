@@ -12,6 +12,7 @@ import tyro
 
 from osfcore.errors import check_seed
 from osfcore.io.output_paths import check_place
+from osfcore.io.video_file import need_ffmpeg
 
 from .command import DataCommand, Device, last_of, report_of
 
@@ -83,6 +84,7 @@ class RunEpisode(DataCommand):
         )  # fmt: skip
         report = report_of(run_episode(order))
         self.say(*_summary(report), f"Report, frames, video and recording: {self.out}")
+        self.say_if_no_video()
         return {key: value for key, value in report.items() if key not in ("steps", "actions", "goal")}
 
 
@@ -112,6 +114,7 @@ class Clip(DataCommand):
         """Make it."""
         from ..episodes.clip import FPS, clip_of
 
+        need_ffmpeg("A clip")  # before the work
         with ThreadPoolExecutor(2) as executor:
             last = last_of(clip_of(self.episode, self.assets, self.out, executor))
         seconds = round(last.total / FPS, 1)

@@ -69,8 +69,10 @@ def _run(arguments: list[str]) -> int:
         return 0
     command = _parsed(arguments)
     data_dir = getattr(command, "data_dir", None)
-    if data_dir is not None:  # compiled code is kept there, by child processes, too
-        os.environ.setdefault("NUMBA_CACHE_DIR", str(data_dir.absolute() / "compiled"))
+    if data_dir is not None:  # what is made once is kept there, by child processes, too
+        os.environ["NUMBA_CACHE_DIR"] = os.environ.get("NUMBA_CACHE_DIR") or str(data_dir.absolute() / "compiled")
+        if not os.access(os.path.expanduser("~"), os.W_OK):  # cma loads Matplotlib, which keeps its list of fonts
+            os.environ.setdefault("MPLCONFIGDIR", str(data_dir.absolute() / "matplotlib"))
     result = command.run()
     if command.json:
         import json

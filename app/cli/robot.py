@@ -143,6 +143,7 @@ class RobotDriveCommand(DataCommand):
                 said = note
         report = drive.finish()
         self.say(f"{report['text']} {report['steps_done']} actions, {report['seconds']:.0f} s. Report: {self.out}")
+        self.say_if_no_video()
         return {key: value for key, value in report.items() if key not in ("steps", "actions", "goal")}
 
     def _order(self) -> Any:  # noqa: ANN401  a DriveOrder, whose module is heavy

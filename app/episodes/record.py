@@ -32,6 +32,7 @@ from osfcore.io.files import as_mapping, read_json, write_atomically, write_json
 from osfcore.io.image_file import to_uint8, write_png
 from osfcore.io.json_codec import encode
 from osfcore.io.scene_file import ObjectJson, estimated_to_json, state_to_json
+from osfcore.io.video_file import ffmpeg_or_none
 from osfcore.metrics.image_errors import ssim
 from osfcore.metrics.success import RearrangementTask, score_of
 from osfcore.objects.asset import Symmetry
@@ -200,13 +201,13 @@ class EpisodeRecord:
         self._end = self._end or (outcome, reason)
         self._write()
 
-    def finish(self, *, video: bool = True) -> dict[str, Any]:
-        """Write the video, if one is wanted, and return the report.
+    def finish(self) -> dict[str, Any]:
+        """Write the video, where there is an ffmpeg, and return the report.
 
         Raises:
             CannotWrite: if the disk refuses.
         """
-        if video:
+        if ffmpeg_or_none() is not None:
             write_video(self._folder / VIDEO_FILE, read_frames(self._folder / FRAMES_FOLDER))
         return self._write()
 

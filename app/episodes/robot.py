@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -125,12 +124,12 @@ class RobotDrive:
             raise
 
     def finish(self) -> dict[str, Any]:
-        """Write the video, where ffmpeg is there, and return the report.
+        """Write the video, where there is an ffmpeg, and return the report.
 
         Raises:
             CannotWrite: if the disk refuses.
         """
-        return self._record.finish(video=find_spec("imageio_ffmpeg") is not None)
+        return self._record.finish()
 
     def close(self) -> None:
         """Stop the robot and let it go."""

@@ -20,6 +20,7 @@ from osfcore.io.files import file_at_once, read_json, write_atomically
 from osfcore.io.image_file import encode_png
 from osfcore.io.json_codec import Entry, decode
 from osfcore.io.scene_file import CameraJson, ObjectJson, StateJson
+from osfcore.io.video_file import ffmpeg_or_none, need_ffmpeg
 from osfcore.paper.method import Method
 
 from ..episodes.file_names import (
@@ -194,9 +195,11 @@ class Episodes:
             GoalUnknown: if it never knew goal poses.
             QueueFull: if too many jobs wait.
             StorageFull: if nothing more may be written.
+            MissingExtra: if there is no ffmpeg.
         """
         if not job.is_finished:
             raise EpisodeGoesOn
+        need_ffmpeg("A clip")
         if self.settings(job).method == "paper":
             raise GoalUnknown
         self.trajectory(job)
@@ -324,7 +327,7 @@ class Episodes:
         """Names that can be downloaded now; those of an episode that was broken off are made when they are."""
         folder = self._folder(job)
         has_frames = job.is_finished and (folder / FRAMES_FOLDER / "000.png").is_file()
-        made = (VIDEO_FILE, RECORDING_FILE, ARCHIVE_FILE) if has_frames else ()
+        made = (RECORDING_FILE, ARCHIVE_FILE, *[VIDEO_FILE] * (ffmpeg_or_none() is not None)) if has_frames else ()
         return tuple(name for name in FILES if (folder / name).is_file() or name in made)
 
     def file(self, job: Job, name: str) -> Path:

@@ -4,25 +4,51 @@ ffmpeg converts to BT.601 unless told otherwise, and players take a high picture
 colours are then up to a tenth off. So the file is BT.709, and says so. Its index comes first: browsers play it before
 they have all of it.
 
-Raises:
-    ModuleNotFoundError: on import, if ffmpeg is not installed, which the extras sim and lerobot bring.
+ffmpeg is a program of its own, under the GPL where it encodes H.264: the extra video brings one, and one on the path
+serves as well.
 """
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from jaxtyping import UInt8
 
 from osfcore.errors import CannotWrite, InvalidInput
+from osfcore.extras import missing, need
 from osfcore.io.files import file_at_once
 
 _COLOURS = "scale=out_color_matrix=bt709:out_range=tv,setparams=color_primaries=bt709:color_trc=bt709"
+
+
+def ffmpeg_or_none() -> str | None:
+    """Return the program that encodes: that of the extra video, else the one on the path, if there is any."""
+    if missing("video"):
+        return shutil.which("ffmpeg")
+    import imageio_ffmpeg
+
+    return imageio_ffmpeg.get_ffmpeg_exe()
+
+
+def need_ffmpeg(what: str) -> str:
+    """Return the program that encodes.
+
+    Args:
+        what: needs it, for the sentence.
+
+    Raises:
+        MissingExtra: if there is none.
+    """
+    program = ffmpeg_or_none()
+    if program is None:
+        need("video", what)
+        raise AssertionError("without ffmpeg, the extra is missing")
+    return program
 
 
 @contextmanager
@@ -39,10 +65,11 @@ def mp4_at_once(
         options: of ffmpeg's encoder, such as "-crf", "20".
 
     Raises:
+        MissingExtra: if there is no ffmpeg.
         InvalidInput: if an image is of another size or kind.
         CannotWrite: if it cannot be encoded or written; what was there before is untouched.
     """
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    command = [need_ffmpeg("A video"), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-", "-vf", _COLOURS, "-an", "-vcodec", "libx264"]
     command += ["-pix_fmt", "yuv420p", *options, "-movflags", "+faststart", "-f", "mp4"]
     with file_at_once(path) as partial:

@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 from PIL import ExifTags, Image, ImageCms, ImageFile
 from PIL.TiffImagePlugin import TiffImageFile
-from pillow_heif import register_heif_opener
 
 from osfcore.errors import CorruptFile, OsfError, check_ranges, shown
 from osfcore.estimation.camera_response import Encoding, linear_from_encoded
+from osfcore.extras import MissingExtra, missing
 from osfcore.geometry.poses import Pose
 from osfcore.photo.board import Intrinsics, camera_matrix
 from osfcore.photo.photograph import Masks, Photograph
@@ -37,6 +37,7 @@ ASSUMED_DIAGONAL_DEG = 75.0  # field of view of a phone's main camera, from corn
 _FILM_DIAGONAL_MM = 43.27  # of the 36 x 24 mm to which equivalent focal lengths refer
 _FOCAL_RANGE = 0.2, 50.0  # per longest side: what lies outside is a mistake in the metadata
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of EXIF's FocalPlaneResolutionUnit
+_HEIC = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")  # brands of ISO/IEC 23008-12
 _WIDE_MODES = ("I;16", "I;16B", "I;16L", "I;16N")
 # Quarter turns counter-clockwise, then whether to mirror, by EXIF's orientation.
 _UPRIGHT = {2: (0, True), 3: (2, False), 4: (2, True), 5: (3, True), 6: (3, False), 7: (1, True), 8: (1, False)}
@@ -129,14 +130,23 @@ class _LargeTiff(TiffImageFile):
 
 def _opened(name: str, content: bytes) -> Image.Image:
     """Read a picture's header, as `Image.open` does, but without its limit on pixels, which all threads share."""
-    register_heif_opener()
     Image.init()
+    without_heic = missing("heic")
+    if not without_heic:
+        from pillow_heif import register_heif_opener
+
+        register_heif_opener()
     for kind in FORMATS:
+        if kind not in Image.OPEN:
+            continue
         opener, accepts = Image.OPEN[kind]
         with contextlib.suppress(SyntaxError, IndexError, TypeError, struct.error):  # of another format
             accepted = accepts is None or accepts(content[:16])
             if accepted and not isinstance(accepted, str):  # which says why this Pillow cannot
                 return (_LargeTiff if opener is TiffImageFile else opener)(io.BytesIO(content), "")
+    if without_heic and content[4:8] == b"ftyp" and content[8:12] in _HEIC:
+        lacking = str(MissingExtra("HEIC", "heic", without_heic)).removesuffix(".")
+        raise CorruptFile(name, f"{lacking}, or send a JPEG")
     kinds = "a JPEG, PNG, WebP, HEIC, AVIF, TIFF, GIF or BMP file"
     raise CorruptFile(name, f"it is no picture that can be read here; send {kinds}")
 

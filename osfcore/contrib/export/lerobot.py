@@ -18,7 +18,7 @@ from osfcore.errors import InvalidInput
 from osfcore.extras import need
 from osfcore.geometry.workspace import STEP_S
 from osfcore.io.files import folder_at_once, write_atomically, write_json
-from osfcore.io.video_file import mp4_at_once
+from osfcore.io.video_file import mp4_at_once, need_ffmpeg
 
 # Keys and meanings of the features of a table.
 #
@@ -357,6 +357,7 @@ def write_dataset(folder: Path, episodes: Iterable[LeRobotEpisode]) -> DatasetSi
         CannotWrite: if the disk refuses.
     """
     need("lerobot", "A LeRobot data set")
+    need_ffmpeg("A LeRobot data set")
     with folder_at_once(folder) as partial:
         writer = _Writer(partial)
         for episode in episodes:

@@ -1,6 +1,7 @@
 """Episodes as the service keeps them: what is refused, what is told, and one that really runs."""
 
 import csv
+import importlib.util
 import io
 import json
 import os
@@ -33,6 +34,7 @@ from app.services.goals import GoalRefused, NoTable
 from app.storage.database import CannotStore
 from app.storage.records import GoalRecord, GoalStore
 from osfcore.errors import CorruptFile, InvalidInput, UnknownName
+from osfcore.extras import MissingExtra
 from osfcore.geometry.cameras import goal_camera
 from osfcore.geometry.poses import Pose
 from osfcore.io.image_file import encode_png, write_png
@@ -288,6 +290,16 @@ def test_video_and_recording_are_made_when_they_are_asked_for(episodes, runner, 
     made = os.stat(recording).st_ino
     assert os.stat(episodes.file(broken_off, RECORDING_FILE)).st_ino == made  # once
     assert [path.name for path in folder.glob(".*")] == []
+
+
+def test_without_ffmpeg_there_is_all_but_video_and_clip(episodes, runner, broken_off, monkeypatch, tmp_path):
+    found = importlib.util.find_spec
+    monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None if name == "imageio_ffmpeg" else found(name))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert set(episodes.files(broken_off)) == set(FILES) - {CLIP_FILE, VIDEO_FILE}
+    assert episodes.file(broken_off, ARCHIVE_FILE).is_file()
+    with pytest.raises(MissingExtra, check=about("imageio_ffmpeg")):
+        episodes.make_clip(broken_off)
 
 
 @pytest.mark.parametrize("state", ["running", "paused"])

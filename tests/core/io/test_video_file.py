@@ -1,12 +1,15 @@
 """MP4 files as others read them: where their index is, which colours they say they have, and which they show."""
 
+import importlib.util
 import resource
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
 from osfcore.errors import CannotWrite, InvalidInput
+from osfcore.extras import MissingExtra
 from osfcore.io.video_file import mp4_at_once
 from tests.support.errors import about
 
@@ -46,6 +49,27 @@ def test_the_index_comes_first_and_colours_are_named_and_kept(tmp_path, width, h
     shown = video.read()[1][height // 2, width // 12 :: width // 6, ::-1]
     video.release()
     assert np.abs(shown.astype(int) - COLOURS).max() <= 4  # with the matrix of BT.601 up to 27
+
+
+@pytest.fixture
+def no_ffmpeg(monkeypatch, tmp_path):
+    """Neither the extra video nor an ffmpeg on the path; a folder that is on the path."""
+    found = importlib.util.find_spec
+    monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None if name == "imageio_ffmpeg" else found(name))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    return tmp_path
+
+
+def test_what_is_missing_is_told(no_ffmpeg):
+    with pytest.raises(MissingExtra, match=r"osf-manipulation\[video\]"):
+        write(no_ffmpeg / "video.mp4", [stripes(96, 64)])
+    assert list(no_ffmpeg.iterdir()) == []
+
+
+def test_an_ffmpeg_on_the_path_serves_as_well(no_ffmpeg):
+    (no_ffmpeg / "ffmpeg").symlink_to(imageio_ffmpeg.get_ffmpeg_exe())
+    write(no_ffmpeg / "video.mp4", [stripes(96, 64)])
+    assert "moov" in atoms((no_ffmpeg / "video.mp4").read_bytes())
 
 
 def test_an_image_of_another_size_or_kind_makes_no_video(tmp_path):

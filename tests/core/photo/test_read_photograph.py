@@ -1,3 +1,4 @@
+import importlib.util
 import io
 import struct
 import sys
@@ -138,6 +139,16 @@ def test_heic_of_a_phone_stands_upright_and_has_its_focal_length():
     seen = read_photograph(png(turned_by(6, blocks()), "HEIF", quality=95, exif=exif(6, FocalLengthIn35mmFilm=26)))
     assert np.abs(seen.encoded.astype(int) - blocks()).mean() < 8
     assert seen.focal_px == pytest.approx(26 / DIAGONAL_MM * np.hypot(96, 64))
+
+
+def test_heic_without_its_extra_is_told_how_to_get_it(monkeypatch):
+    content, found = png(blocks(), "HEIF"), importlib.util.find_spec
+    monkeypatch.setattr("osfcore.extras.find_spec", lambda name: None if name == "pillow_heif" else found(name))
+    monkeypatch.delitem(Image.OPEN, "HEIF")
+    with pytest.raises(CorruptFile) as error:
+        read_photograph(content)
+    assert "pip install 'osf-manipulation[heic]'" in str(error.value)
+    assert "JPEG" in str(error.value)
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
