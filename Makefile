@@ -3,6 +3,7 @@
 # make docs   the site of documents, in build/docs
 # make test-pythons   that the library installs and runs on later Pythons, where there is no PyBullet
 # make check-wheels   that all packages are to be had for macOS, Windows and ARM
+# make test-lowest   the quick tests with the lowest versions that pyproject.toml allows
 # Variables: PYTHON=python3.11   TORCH_INDEX=<CPU-only wheel index>   PORT=8000   OSF_DATA_DIR=<where objects and runs live>
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
@@ -18,7 +19,7 @@ LATER := 3.12 3.13
 # What is checked for other systems, too; the rest asks nothing of the system, and all of it would take minutes.
 ASKS_THE_SYSTEM := app osfcore/io
 
-.PHONY: demo install dev test test-all test-pythons check-wheels coverage lint docs soak bench clean
+.PHONY: demo install dev test test-all test-pythons test-lowest check-wheels coverage lint docs soak bench clean
 
 demo: install
 	@$(BIN)/osf assets fetch
@@ -67,6 +68,19 @@ test-pythons: dev $(LATER:%=.cache/python%/.installed)
 check-wheels: dev
 	$(PIP) install -q uv
 	PATH=$(BIN):$$PATH $(BIN)/python .ci/check_wheels.py
+
+# With uv, which alone can choose the lowest versions. Torch comes with CUDA unless TORCH_INDEX names another index.
+test-lowest: .cache/lowest/.installed
+	.cache/lowest/bin/python -m pytest
+
+.cache/lowest/.installed: pyproject.toml
+	$(PYTHON) -m venv .cache/lowest
+	.cache/lowest/bin/pip install -q uv
+	.cache/lowest/bin/uv pip compile -q --resolution lowest-direct $(if $(TORCH_INDEX),--index $(TORCH_INDEX),) --extra dev pyproject.toml -o .cache/lowest/versions.txt
+	.cache/lowest/bin/pip install -q $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),) -r .cache/lowest/versions.txt
+	.cache/lowest/bin/pip install -q --no-deps gym-pusht==0.1.8
+	.cache/lowest/bin/pip install -q --no-deps -e .
+	@touch $@
 
 coverage: dev
 	$(BIN)/pytest -n 2 --dist loadfile --cov=osfcore --cov=app --cov-report=term:skip-covered

@@ -9,7 +9,7 @@ from osfcore.errors import OsfError
 
 PACKAGES = {
     "sim": ("mujoco", "coacd"),
-    "serve": ("fastapi", "fastapi_offline", "uvicorn", "viser", "websockets", "msgspec", "prometheus_client",
+    "serve": ("fastapi", "uvicorn", "viser", "websockets", "msgspec", "prometheus_client",
               "itsdangerous", "pydantic_settings", "mujoco"),
     "gym": ("gymnasium",),
     "mcap": ("foxglove",),

@@ -171,8 +171,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
 
 
 def _add_docs(app: FastAPI) -> None:
-    """Swagger UI with scripts from a package on this machine."""
-    app.mount("/docs-assets", StaticFiles(packages=[("fastapi_offline", "static")]), name="docs-assets")
+    """Swagger UI with the scripts that lie beside those of the page."""
 
     @app.get("/docs", include_in_schema=False)
     async def docs(request: Request) -> HTMLResponse:
@@ -181,7 +180,7 @@ def _add_docs(app: FastAPI) -> None:
         return get_swagger_ui_html(
             openapi_url=f"{base}/api/openapi.json",
             title="OSF manipulation: REST interface",
-            swagger_js_url=f"{base}/docs-assets/swagger-ui-bundle.js",
-            swagger_css_url=f"{base}/docs-assets/swagger-ui.css",
-            swagger_favicon_url=f"{base}/docs-assets/favicon.png",
+            swagger_js_url=f"{base}/vendor/swagger-ui-5.35.0.js",
+            swagger_css_url=f"{base}/vendor/swagger-ui-5.35.0.css",
+            swagger_favicon_url=f"{base}/icon.svg",
         )
