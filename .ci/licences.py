@@ -32,9 +32,9 @@ The program is under the MIT licence. The table lists all that `pip install '{PR
 states it; `python .ci/licences.py` has made it. No package is under the GPL or AGPL. GCC's runtime, which wheels for
 Linux carry, has an exception for programs that use it. FFmpeg in OpenCV's wheel is a library of its own under the LGPL.
 
-What is under the GPL comes by extras that are asked for: `heic` (pillow-heif, with libx265) and `video` (imageio-ffmpeg,
-with libx264). The page's own copies of fflate and uPlot (MIT) and Swagger UI (Apache-2.0) are in `static/vendor`, with
-their licences.
+What is under the GPL comes by extras that are asked for: `heic` (pillow-heif, with libx265), and `video`
+(imageio-ffmpeg, with libx264). The page's own copies of fflate and uPlot (MIT) and of Swagger UI (Apache-2.0) are in
+`static/vendor`, with their licences.
 
 | package | needed by | licence | also contains |
 |---|---|---|---|
