@@ -22,8 +22,7 @@ ASKS_THE_SYSTEM := app osfcore/io
 .PHONY: demo install dev test test-all test-pythons test-lowest check-wheels coverage lint docs soak bench clean
 
 demo: install
-	@$(BIN)/osf assets fetch
-	@$(BIN)/osf serve --port $(PORT)
+	@$(BIN)/osf demo --port $(PORT)
 
 install: $(VENV)/.installed
 dev: $(VENV)/.dev-installed

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,12 +13,15 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from osfcore.errors import OsfError
+from osfcore.progress import Progress
 
 from .command import DataCommand, choice_of, follow, show_table
 from .workers import worker_pool
 
 if TYPE_CHECKING:
     from osfcore.objects.asset_library import AssetLibrary
+
+_TELLS_EVERY_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -64,13 +70,13 @@ class AssetsFetch(DataCommand):
         library = self.assets
         source = source_from(self.source, self.data_dir / "cache")
         chosen = self.names or source.names()
-        is_work = any(self.force or not library.has(name) for name in chosen)
-        with worker_pool(self.workers if is_work else 1) as executor:
-            # While this one downloads, so that the first episode need not wait for compilers.
+        with worker_pool(self.workers) as executor:
+            # While this one downloads, so that the first episode need not wait for compilers. Objects may be here from
+            # an earlier version of the program, whose compiled code does not serve this one.
             compiled = executor.submit(_compile) if executor is not None else None
             follow(fetch(chosen, source, library, executor, force=self.force))
-            if compiled is not None and not compiled.done():
-                self.say("Compiling renderer and planner, once; this takes up to some minutes")
+            if compiled is not None:
+                follow(_waiting_for(compiled))
         return {"objects": list(chosen), "available": list(library.names()), "data_dir": str(self.data_dir)}
 
 
@@ -107,6 +113,15 @@ class AssetsAdd(DataCommand):
 
 
 Assets = choice_of(list=AssetsList, fetch=AssetsFetch, add=AssetsAdd)
+
+
+def _waiting_for(compiled: Future[None]) -> Iterator[Progress]:
+    """Yield how long it takes, every second, until everything is compiled or read from what was compiled before."""
+    began = time.monotonic()
+    while not wait([compiled], timeout=_TELLS_EVERY_S).done:
+        waited = f"{time.monotonic() - began:.0f} s"
+        yield Progress(0, 1, f"Preparing renderer and planner; compiling once takes minutes ({waited})")
+    yield Progress(1, 1, "Renderer and planner ready")
 
 
 def _compile() -> None:

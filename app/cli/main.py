@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 # For each command the class, or union of classes, in app/cli and a description. Modules may take more than a second, so
 # that only the command's own is imported.
 COMMANDS = {
+    "demo": ("demo:Demo", "Fetch objects, start the service, open its page."),
     "serve": ("serve:Serve", "Start the service and its page."),
     "assets": ("assets:Assets", "List, fetch and add objects."),
     "collect": ("collect:Collect", "Collect image sets, pushes and observations."),

@@ -1,4 +1,4 @@
-"""`osf serve`: the service and its page on one port, and its log; `osf backup` and `osf restore`: what it keeps."""
+"""`osf serve` and `osf demo`: the service and its page on one port, and its log; `osf backup` and `osf restore`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from logging.handlers import RotatingFileHandler
@@ -72,6 +73,10 @@ class Serve(DataCommand):
 
     def run(self) -> dict[str, Any]:
         """Serve until interrupted."""
+        return self.serve()
+
+    def serve(self, on_ready: Callable[[str], object] = lambda _: None) -> dict[str, Any]:
+        """Serve until interrupted; call `on_ready` with the address of the page once the service answers."""
         check_memory()
         need("serve", "This command")
         from ..storage.database import check_data_dir
@@ -82,7 +87,7 @@ class Serve(DataCommand):
             url = _url(self.host, listener.getsockname()[1])
             settings, login = _settings(self)
             start_log(self.data_dir)
-            server = _server(settings, url + login)
+            server = _server(settings, url + login, on_ready)
             # The server has a handler of its own, and raises the signal again once everything has stopped.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             # A terminal that closes asks for the same as `kill`.
@@ -178,8 +183,8 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def _server(settings: Settings, url: str) -> uvicorn.Server:
-    """A server that prints its address once it is ready, and ends what keeps requests before it waits for them."""
+def _server(settings: Settings, url: str, on_ready: Callable[[str], object]) -> uvicorn.Server:
+    """A server that tells its address once it is ready, and ends what keeps requests before it waits for them."""
     import uvicorn
 
     from ..api.app_factory import create_app
@@ -197,6 +202,7 @@ def _server(settings: Settings, url: str) -> uvicorn.Server:
                 missing = "There are no objects on this machine yet; fetch them on the page or with 'osf assets fetch'."
                 print(missing, file=sys.stderr, flush=True)
             print(url, flush=True)
+            on_ready(url)
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             if self.should_exit:  # who asks twice does not want to wait for anything

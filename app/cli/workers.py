@@ -43,14 +43,14 @@ def worker_pool(
         return
     if not 1 <= workers <= MAX_WORKERS:
         raise InvalidInput("number of workers", workers, f"between 1 and {MAX_WORKERS}")
-    executor = None
+    executor, others = None, set(multiprocessing.active_children())
     if workers > 1:
         with suppress(OSError):  # no shared memory, as in some sandboxes: slower, but it works
             executor = ProcessPoolExecutor(workers, mp_context=_Workers(), initializer=_end_with_parent)
     try:
         yield executor
-    except KeyboardInterrupt:  # a piece of work may take minutes
-        for worker in multiprocessing.active_children():
+    except (KeyboardInterrupt, OsfError):  # a piece of work may take minutes
+        for worker in set(multiprocessing.active_children()) - others:
             worker.terminate()
         raise
     finally:
