@@ -18,6 +18,7 @@ PACKAGES = {
     "lerobot": ("pyarrow",),
     "ros": ("websockets",),
     "usd": ("pxr",),
+    "mcp": ("mcp",),
     "experiments": ("matplotlib", "jinja2"),
     "pusht": ("gym_pusht", "pytorch_mppi", "pymunk", "pygame", "shapely"),
 }  # fmt: skip

@@ -64,6 +64,7 @@ OWNERS = {  # who alone may import a package
     "imageio_ffmpeg": ("osfcore.io.video_file",),
     "pxr": ("osfcore.contrib.export.usd",),
     "pyarrow": ("osfcore.contrib.export.lerobot",),
+    "mcp": ("osfcore.contrib.mcp_server",),
     "fastapi": ("app",),
     "uvicorn": ("app",),
     "tyro": ("app",),

@@ -32,6 +32,7 @@ COMMANDS = {
     "bench": ("bench:Bench", "Measure what things cost on this machine."),
     "export": ("exchange:Export", "Scenes, fields and poses for other programs."),
     "import": ("exchange:Import", "Data sets of others for 'osf estimate'."),
+    "mcp": ("mcp:Mcp", "Offer a service to an assistant (MCP)."),
     "backup": ("serve:Backup", "Write all that the service keeps to one zip."),
     "restore": ("serve:Restore", "Make a data directory from a backup."),
     "check": ("exchange:Check", "Check a file or folder of any kind."),

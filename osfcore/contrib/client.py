@@ -416,6 +416,10 @@ class Client:
         }
         return RemoteScene.of(self._service.json("POST", "/api/scenes", body))
 
+    def scenes(self) -> tuple[RemoteScene, ...]:
+        """Return the tables, oldest first."""
+        return tuple(map(RemoteScene.of, self._service.json("GET", "/api/scenes")["scenes"]))
+
     def scene(self, scene: str | None = None) -> RemoteScene:
         """Return the present state of a table."""
         return RemoteScene.of(self._service.json("GET", f"/api/scenes/{scene or self._shown()}"))
@@ -476,6 +480,10 @@ class Client:
         """Make a goal image in which `moved` objects of a table lie at random places; None for a random number."""
         body = {"scene": scene, "random": {"seed": seed, "moved": moved}}
         return Goal.of(self._service.json("POST", "/api/goals", body))
+
+    def goal(self, goal: str) -> Goal:
+        """Return the goal that has an identifier."""
+        return Goal.of(self._service.json("GET", f"/api/goals/{goal}"))
 
     def goal_image(self, goal: Goal) -> Float32[np.ndarray, "h w 3"]:
         """Return the image of a goal, linear RGB in [0, 1]."""
@@ -552,6 +560,14 @@ class Client:
     def episodes(self) -> tuple[Episode, ...]:
         """Return the latest episodes, newest first. Their `steps` are empty."""
         return tuple(decode(Episode, one, "episode") for one in self._service.json("GET", "/api/episodes")["episodes"])
+
+    def latest(self, episode: str) -> Episode:
+        """Return the present state of the episode that has an identifier."""
+        return decode(Episode, self._service.json("GET", f"/api/episodes/{episode}"), "episode")
+
+    def frame(self, episode: Episode, step: int) -> Float32[np.ndarray, "h w 3"]:
+        """Return a picture of one of an episode's `steps`, in [0, 1]: goal, table, estimate and cameras."""
+        return _image(self._service.bytes(f"/api/episodes/{episode.id}/frames/{step}.png"))
 
     def cancel(self, running: Episode | Estimate) -> None:
         """Cancel an episode or an estimate. The steps of an episode so far are kept.
