@@ -19,6 +19,7 @@ PACKAGES = {
     "ros": ("websockets",),
     "usd": ("pxr",),
     "mcp": ("mcp",),
+    "slurm": ("submitit",),
     "experiments": ("matplotlib", "jinja2"),
     "pusht": ("gym_pusht", "pytorch_mppi", "pymunk", "pygame", "shapely"),
 }  # fmt: skip

@@ -68,6 +68,7 @@ OWNERS = {  # who alone may import a package
     "fastapi": ("app",),
     "uvicorn": ("app",),
     "tyro": ("app",),
+    "submitit": ("app.cli.cluster_jobs",),
     "osfcore.experiments": ("osfcore.experiments", "app.cli"),
 }
 SOURCES = {

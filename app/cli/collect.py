@@ -93,7 +93,8 @@ class CollectPushesCommand(DataCommand):
     workers: int = 2
     """Processes that simulate side by side; the content does not depend on it."""
     cluster: str | None = None
-    """Address of a Dask scheduler whose workers simulate instead; they need the same data folder."""
+    """Address of a Dask scheduler whose workers simulate instead, or slurm, or slurm:partition=gpu,time=60: a job of
+    SLURM for each episode. They need the same data folder."""
 
     def run(self) -> dict[str, Any]:
         """Collect; the result has the shares of steps with contact and motion, and the rate."""

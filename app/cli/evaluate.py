@@ -71,7 +71,8 @@ class ParallelEvaluation(Evaluation):
     workers: int = 2
     """Processes that work side by side."""
     cluster: str | None = None
-    """Address of a Dask scheduler whose workers do the work instead; they need the same data folder."""
+    """Address of a Dask scheduler whose workers do the work instead, or slurm, or slurm:partition=gpu,time=60: a job
+    of SLURM each. They need the same data folder."""
 
     def _pool(self) -> AbstractContextManager[Executor | None]:
         return worker_pool(self.workers, self.cluster)
@@ -492,7 +493,8 @@ class ReproduceCommand(DataCommand):
     workers: int = 2
     """Processes that work side by side."""
     cluster: str | None = None
-    """Address of a Dask scheduler whose workers do the work instead; they need the same data folder."""
+    """Address of a Dask scheduler whose workers do the work instead, or slurm, or slurm:partition=gpu,time=60: a job
+    of SLURM each. They need the same data folder."""
 
     def run(self) -> dict[str, Any]:
         """Measure with a progress bar; the result holds all figures of the report."""

@@ -48,7 +48,8 @@ class TrainFieldCommand(Command):
     workers: int = 1
     """Processes that train several objects side by side, each in its share of the threads."""
     cluster: str | None = None
-    """Address of a Dask scheduler whose workers train instead; they need the same image sets at the same place."""
+    """Address of a Dask scheduler whose workers train instead, or slurm, or slurm:partition=gpu,time=60: a job of SLURM
+    for each object. They need the same image sets at the same place."""
 
     def run(self) -> dict[str, Any]:
         """Train with a progress bar; the result has PSNR [dB] on the test images, size and time."""

@@ -1,4 +1,4 @@
-"""Worker processes for commands that take `--workers`, and Dask clusters for those that take `--cluster`."""
+"""Worker processes for commands that take `--workers`, and Dask or SLURM for those that take `--cluster`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from osfcore.errors import InvalidInput, OsfError, WorkerDied
 
 from ..processes.child_process import interrupts_held_back
+from .cluster_jobs import job_executor, names_jobs
 
 MAX_WORKERS = 256
 
@@ -29,16 +30,17 @@ def worker_pool(
 
     Args:
         workers: processes of this machine.
-        cluster: address of a Dask scheduler whose workers share the work instead.
+        cluster: address of a Dask scheduler whose workers share the work instead, or how `job_executor` names jobs.
         answers_within_s: how long the scheduler may take to answer.
 
     Raises:
         InvalidInput: if the number is out of range, or nothing answers at the address.
-        OsfError: if Dask is not installed.
+        OsfError: if Dask or submitit is not installed.
         WorkerDied: if a piece of work has ended several workers of the cluster.
     """
     if cluster is not None:
-        with _cluster(cluster, answers_within_s) as executor:
+        jobs = job_executor(cluster, workers) if names_jobs(cluster) else _cluster(cluster, answers_within_s)
+        with jobs as executor:
             yield executor
         return
     if not 1 <= workers <= MAX_WORKERS:
