@@ -129,6 +129,7 @@ def test_a_table_is_made_pushed_and_seen(osf, table):
     assert osf.health().status in ("ok", "degraded")
     assert {BOX, BOTTLE} <= set(osf.objects())
     assert table.state.names == (BOX, BOTTLE)
+    assert table.id in [one.id for one in osf.scenes()]
     assert [camera.name for camera in table.cameras] == ["0", "1", "2", "3", "goal"]
     velocity = -table.state.pusher / np.abs(table.state.pusher).max() * [0.2, 0.2, 0]
     moved = osf.act(np.tile(velocity, (2, 1)))
@@ -145,7 +146,7 @@ def test_a_table_is_made_pushed_and_seen(osf, table):
 def test_goals_are_sent_and_made(osf, table, tmp_path):
     drawn = osf.random_goal(1, moved=1)
     assert set(drawn.names) == {BOX, BOTTLE}
-    image = osf.goal_image(drawn)
+    image = osf.goal_image(osf.goal(drawn.id))
     assert image.shape == (drawn.camera.height, drawn.camera.width, 3)
     sent = osf.upload_goal(image, name="As drawn")
     assert (sent.name, sent.names) == ("As drawn", ())
@@ -254,6 +255,8 @@ def test_an_episode_from_photo_to_files(osf, table, tmp_path):
     assert (last.status, last.outcome, last.scene) == ("done", "reached", table.id)
     assert max(last.steps[-1].to_goal_mm.values()) < 10
     assert last.id in [one.id for one in osf.episodes()]
+    assert osf.latest(last.id) == last
+    assert osf.frame(last, 0).shape[2] == 3
     report = osf.download(last, "report.json", tmp_path)
     assert json.loads(report.read_text())["steps"]
     with pytest.raises(ServiceError):
