@@ -1,4 +1,4 @@
-"""`osf serve` and `osf demo`: the service and its page on one port, and its log; `osf backup` and `osf restore`."""
+"""`osf serve`: the service and its page on one port, and its log; `osf backup` and `osf restore`: what it keeps."""
 
 from __future__ import annotations
 
