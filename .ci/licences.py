@@ -26,11 +26,13 @@ CONTAINED = {
     "scipy": _GCC,
     "torch": _GCC,
 }
+_CUDA = ("nvidia-", "cuda-", "triton")  # come with some builds of torch only
 _HEAD = f"""# Licences
 
 The program is under the MIT licence. The table lists all that `pip install '{PROJECT}[serve]'` brings, as each package
 states it; `python .ci/licences.py` has made it. No package is under the GPL or AGPL. GCC's runtime, which wheels for
 Linux carry, has an exception for programs that use it. FFmpeg in OpenCV's wheel is a library of its own under the LGPL.
+Builds of torch with CUDA also bring NVIDIA's libraries under NVIDIA's own licence; the CPU builds do not.
 
 What is under the GPL comes by extras that are asked for: `heic` (pillow-heif, with libx265), and `video`
 (imageio-ffmpeg, with libx264). The page's own copies of fflate and uPlot (MIT) and of Swagger UI (Apache-2.0) are in
@@ -50,7 +52,7 @@ def table() -> str:
 
 
 def closure() -> dict[str, str]:
-    """Return the names of all packages, and the first of core and extras that needs each."""
+    """Return the names of all packages but those of CUDA, and the first of core and extras that needs each."""
     path = Path(__file__).parents[1] / "pyproject.toml"
     project = tomllib.loads(path.read_text(encoding="utf-8"))["project"]
     found: dict[str, str] = {}
@@ -59,7 +61,8 @@ def closure() -> dict[str, str]:
         for requirement in map(Requirement, wanted):
             if requirement.name != PROJECT and _applies(requirement, ()):
                 for name in _with_dependencies(requirement, set()):
-                    found.setdefault(name, extra)
+                    if not name.startswith(_CUDA):
+                        found.setdefault(name, extra)
     return found
 
 
@@ -90,4 +93,4 @@ def _normalized(name: str) -> str:
 
 
 if __name__ == "__main__":
-    print(table(), end="")  # noqa: T201
+    print(table(), end="")

@@ -6,7 +6,9 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future, wait
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,16 +69,19 @@ class AssetsFetch(DataCommand):
         """Fetch with a progress bar; return what is there now."""
         from osfcore.objects.fetch import fetch, source_from
 
-        library = self.assets
+        library, done = self.assets, _compiled_stamp()
         source = source_from(self.source, self.data_dir / "cache")
         chosen = self.names or source.names()
         with worker_pool(self.workers) as executor:
             # While this one downloads, so that the first episode need not wait for compilers. Objects may be here from
             # an earlier version of the program, whose compiled code does not serve this one.
-            compiled = executor.submit(_compile) if executor is not None else None
+            compiled = executor.submit(_compile) if executor is not None and not done.exists() else None
             follow(fetch(chosen, source, library, executor, force=self.force))
             if compiled is not None:
                 follow(_waiting_for(compiled))
+                if compiled.exception() is None:
+                    with suppress(OSError):
+                        done.touch()
         return {"objects": list(chosen), "available": list(library.names()), "data_dir": str(self.data_dir)}
 
 
@@ -122,6 +127,16 @@ def _waiting_for(compiled: Future[None]) -> Iterator[Progress]:
         waited = f"{time.monotonic() - began:.0f} s"
         yield Progress(0, 1, f"Preparing renderer and planner; compiling once takes minutes ({waited})")
     yield Progress(1, 1, "Renderer and planner ready")
+
+
+def _compiled_stamp() -> Path:
+    """A file that is there once everything of this version of the program has been compiled."""
+    import osfcore
+    from osfcore.objects.kernel_cache import kernel_folder
+
+    (package,) = osfcore.__path__
+    newest = max(path.stat().st_mtime_ns for path in Path(package).rglob("*.py"))
+    return kernel_folder() / f"complete-{newest}-{version('numba')}"
 
 
 def _compile() -> None:

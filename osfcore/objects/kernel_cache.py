@@ -32,7 +32,7 @@ def kept_kernel(**options: Any) -> Callable[[Function], Function]:  # noqa: ANN4
 
     def decorate(function: Function) -> Function:
         settings: Any = config  # whose names are made while Numba is imported
-        before, settings.CACHE_DIR = settings.CACHE_DIR, str(_place())
+        before, settings.CACHE_DIR = settings.CACHE_DIR, str(kernel_folder())
         try:
             compiled: Any = numba.njit(cache=True, **options)(function)
             return compiled
@@ -42,7 +42,7 @@ def kept_kernel(**options: Any) -> Callable[[Function], Function]:  # noqa: ANN4
     return decorate
 
 
-def _place() -> Path:
+def kernel_folder() -> Path:
     """A folder that can be written: the one that is set (by --data-dir, too), the default one, or a temporary one."""
     chosen = os.environ.get(_VARIABLE)
     place = Path(chosen) if chosen else default_data_dir() / "compiled"
