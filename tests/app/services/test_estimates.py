@@ -88,6 +88,8 @@ class Jobs(JobFolders):
 class Scenes:
     """One scene, whose camera images are grey."""
 
+    simulator = "mujoco"
+
     def __init__(self):
         self.current, self.names = "s", (BOX, MUSTARD)
 
