@@ -68,17 +68,19 @@ check-wheels: dev
 	$(PIP) install -q uv
 	PATH=$(BIN):$$PATH $(BIN)/python .ci/check_wheels.py
 
-# With uv, which alone can choose the lowest versions. Torch comes with CUDA unless TORCH_INDEX names another index.
+# With uv, which alone can choose the lowest versions; of what tests need, any will do. Torch comes with CUDA unless
+# TORCH_INDEX names another index.
+LOWEST := serve heic video experiments cluster slurm gym lerobot mcap mcp ros usd pusht
 test-lowest: .cache/lowest/.installed
 	.cache/lowest/bin/python -m pytest
 
 .cache/lowest/.installed: pyproject.toml
 	$(PYTHON) -m venv .cache/lowest
 	.cache/lowest/bin/pip install -q uv
-	.cache/lowest/bin/uv pip compile -q --resolution lowest-direct $(if $(TORCH_INDEX),--index $(TORCH_INDEX),) --extra dev pyproject.toml -o .cache/lowest/versions.txt
+	.cache/lowest/bin/uv pip compile -q --resolution lowest-direct $(if $(TORCH_INDEX),--index $(TORCH_INDEX),) $(LOWEST:%=--extra %) pyproject.toml -o .cache/lowest/versions.txt
 	.cache/lowest/bin/pip install -q $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),) -r .cache/lowest/versions.txt
+	.cache/lowest/bin/pip install -q -c .cache/lowest/versions.txt -e '.[dev]'
 	.cache/lowest/bin/pip install -q --no-deps gym-pusht==0.1.8
-	.cache/lowest/bin/pip install -q --no-deps -e .
 	@touch $@
 
 coverage: dev

@@ -221,8 +221,10 @@ def _field(hidden: int, tensors: Mapping[str, np.ndarray]) -> KiloOSF:
             raise ValueError(f"{name} holds {tensor.dtype}")
         if kinds == "f" and not np.all(np.isfinite(tensor)):
             raise ValueError(f"{name} has values that are not finite")
+    if tensors["shape"].shape != (3,):
+        raise ValueError(f"{tensors['shape'].shape} numbers of corners")
     shape = tuple(int(n) for n in tensors["shape"])
-    if len(shape) != 3 or min(shape) < 2 or np.prod(shape) > _MAX_CORNERS:
+    if min(shape) < 2 or np.prod(shape) > _MAX_CORNERS:
         raise ValueError(f"shape {shape}")
     shell = np.unpackbits(tensors["shell"], count=int(np.prod(shape))).astype(bool).reshape(shape)
     levels = tensors["levels"]
