@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 from typing import cast
 
 import psutil
@@ -20,6 +21,7 @@ import psutil
 _NICENESS = 5
 _SPAWN = multiprocessing.get_context("spawn")
 _NOTING_TRIES, _NOTING_S = 200, 0.005
+_UNKNOWN = (psutil.Error, OSError)  # a process that has just left, or no file descriptor left to read of it
 
 
 def launch(target: Callable[..., None], name: str, *arguments: object) -> tuple[SpawnProcess, Connection]:
@@ -120,7 +122,7 @@ def is_stopped(pid: int) -> bool:
     """Whether the system has stopped a process; False where that is not known."""
     try:
         return psutil.Process(pid).status() == psutil.STATUS_STOPPED
-    except psutil.Error:
+    except _UNKNOWN:
         return False
 
 
@@ -133,16 +135,14 @@ def end_with_children() -> None:
 def end_children() -> None:
     """End all children of this process and theirs at once, without waiting for them; for signal handlers."""
     for process in multiprocessing.active_children():
-        if process.pid is not None:
-            _kill_tree(process.pid)
+        _kill_tree(process)
 
 
 def end(process: SpawnProcess, grace_s: float = 0.0) -> None:
     """Wait `grace_s` for a process to leave by itself, then end it and its children. Calling it again does nothing."""
     process.join(grace_s)
-    if process.is_alive() and process.pid is not None:
-        _kill_tree(process.pid)
-        process.kill()
+    if process.is_alive():
+        _kill_tree(process)
     process.join()
     for _ in range(_NOTING_TRIES):  # another thread may have taken the exit code, and be about to note it
         if not process.is_alive():
@@ -150,15 +150,16 @@ def end(process: SpawnProcess, grace_s: float = 0.0) -> None:
         time.sleep(_NOTING_S)
 
 
-def _kill_tree(pid: int) -> None:
-    with contextlib.suppress(psutil.Error):  # it has just left
-        head = psutil.Process(pid)
-        head.suspend()  # so that it starts nothing more
-        _kill_started_by(pid)
-        head.kill()
+def _kill_tree(process: BaseProcess) -> None:
+    if process.pid is not None:
+        with contextlib.suppress(*_UNKNOWN):
+            psutil.Process(process.pid).suspend()  # so that it starts nothing more
+            _kill_started_by(process.pid)
+    process.kill()
 
 
 def _kill_started_by(pid: int) -> None:
-    for process in psutil.Process(pid).children(recursive=True):
-        with contextlib.suppress(psutil.Error):
-            process.kill()
+    with contextlib.suppress(*_UNKNOWN):
+        for process in psutil.Process(pid).children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                process.kill()

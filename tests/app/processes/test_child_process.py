@@ -1,4 +1,5 @@
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -62,6 +63,23 @@ def test_ending_takes_grandchildren_along():
     end(process)
     assert process.exitcode == -signal.SIGKILL
     until(lambda: not is_running(child))
+    connection.close()
+
+
+@pytest.mark.slow
+def test_ending_needs_no_file_descriptor():
+    import resource
+
+    process, connection = launch(with_child, "parent")
+    child = connection.recv()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        end(process)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert process.exitcode == -signal.SIGKILL
+    os.kill(child, signal.SIGKILL)  # of whom nothing could be read
     connection.close()
 
 
