@@ -68,8 +68,6 @@ def test_ending_takes_grandchildren_along():
 
 @pytest.mark.slow
 def test_ending_needs_no_file_descriptor():
-    import resource
-
     process, connection = launch(with_child, "parent")
     child = connection.recv()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
